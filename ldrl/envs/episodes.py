@@ -1,0 +1,175 @@
+"""Episodes: where a car starts, what it is told, and the path that it should take."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from ldrl.language import KEYWORDS, Keyword, Sentences, Tokenizer
+from ldrl.towns import Route, Town, UnrealisableError, match_route, plan_routes
+
+__all__ = ["Episode", "builtin_episodes", "load_episodes", "save_episodes"]
+
+START_BEFORE_JUNCTION = 35.0
+"""Starts lie up to this far before the first junction (paper's evaluation), m."""
+END_BEHIND_JUNCTION = (5.0, 10.0)
+"""Paths end this far past the exit of the last manoeuvre, m."""
+FIELDS = ("id", "town", "keyword", "instruction", "start", "path")
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One drive, as a line of an episode file says it.
+
+    Args:
+        id: any string; reports return it unchanged.
+        town: name of the town.
+        keyword: what the instruction means.
+        instruction: what the passenger says.
+        start: x, y (m) and heading (rad).
+        path: points ``(x, y)`` that the car should pass, in order, m.
+
+    Raises:
+        ValueError: a field has the wrong form; the message names it and its value.
+    """
+
+    id: str
+    town: str
+    keyword: str
+    instruction: str
+    start: tuple[float, float, float]
+    path: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        for name in ("id", "town", "keyword", "instruction"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} is {getattr(self, name)!r}; make it a string")
+        object.__setattr__(self, "keyword", Keyword.parse(self.keyword).name)
+        object.__setattr__(self, "start", _numbers("start", self.start, 3))
+        if not isinstance(self.path, list | tuple) or not self.path:
+            raise ValueError(f"path is {self.path!r}; give at least one point [x, y]")
+        path = tuple(_numbers(f"path point {k}", point, 2) for k, point in enumerate(self.path))
+        object.__setattr__(self, "path", path)
+        Tokenizer()([self.instruction])
+
+    def route(self, town: Town) -> Route:
+        """The route along the path.
+
+        Args:
+            town: the episode's town.
+
+        Raises:
+            ValueError: the town is another, or the start or the path is off the road.
+        """
+        if town.name != self.town:
+            raise ValueError(f"episode {self.id!r} is set in {self.town!r}, not in {town.name!r}; split them by town")
+        try:
+            return match_route(town, self.start, self.path)
+        except ValueError as error:
+            raise ValueError(f"episode {self.id!r}: {error}") from None
+
+
+def _numbers(name: str, value: object, count: int) -> tuple:
+    right = isinstance(value, list | tuple) and len(value) == count
+    if not right or not all(isinstance(v, int | float) and math.isfinite(v) for v in value):  # type: ignore[union-attr]
+        raise ValueError(f"{name} is {value!r}; give {count} finite numbers")
+    return tuple(float(v) for v in value)  # type: ignore[union-attr]
+
+
+def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout", seed: int = 0) -> list[Episode]:
+    """The built-in episodes: every distinct route of every keyword that the town can realise.
+
+    Each starts up to 35 m before its first junction and ends 5 to 10 m past the exit of its last manoeuvre.
+
+    Args:
+        town: the town.
+        split: which sentences the passengers say.
+        seed: of the starts, ends and sentences.
+
+    Examples:
+        >>> episodes = builtin_episodes(Town.load("town2"))
+        >>> episodes[0].id, episodes[0].keyword
+        ('town2-left-0', 'left')
+    """
+    rng = random.Random(f"{town.name}-{seed}")
+    sentences = Sentences(split)
+    episodes = []
+    for keyword in KEYWORDS.values():
+        try:
+            routes = plan_routes(town, keyword)
+        except UnrealisableError:
+            continue
+        for k, route in enumerate(routes):
+            start = rng.uniform(0, min(START_BEFORE_JUNCTION, float(town.lane_length[route.lanes[0]])))
+            driven = Route(
+                town, route.lanes, float(town.lane_length[route.lanes[0]]) - start, rng.uniform(*END_BEHIND_JUNCTION)
+            )
+            poses = driven.poses().tolist()
+            episodes.append(
+                Episode(
+                    id=f"{town.name}-{keyword.name.replace(',', '-').replace(' ', '-')}-{k}",
+                    town=town.name,
+                    keyword=keyword.name,
+                    instruction=sentences.sample(keyword, rng),
+                    start=tuple(round(v, 3) for v in poses[0]),
+                    path=tuple((round(x, 2), round(y, 2)) for x, y, _ in poses),
+                )
+            )
+    return episodes
+
+
+def save_episodes(episodes: Iterable[Episode], path: str | Path) -> None:
+    """Write episodes as JSON lines.
+
+    Args:
+        episodes: what to write.
+        path: the file.
+    """
+    Path(path).write_text("".join(json.dumps(asdict(episode)) + "\n" for episode in episodes), encoding="utf-8")
+
+
+def load_episodes(path: str | Path, towns: Sequence[str] | None = None) -> list[Episode]:
+    """Read an episode file.
+
+    Args:
+        path: JSON lines, one episode each; blank lines are skipped.
+        towns: the names that are allowed; None allows all.
+
+    Raises:
+        ValueError: the file has no episode, or a line is broken; the message names the file and the line.
+        FileNotFoundError: there is no such file.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no episode file {str(path)!r}; give a JSON-lines file or 'builtin'")
+    episodes = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            episodes.append(_parse(line, towns))
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from None
+    if not episodes:
+        raise ValueError(f"{path} has no episode; write one JSON object with {', '.join(FIELDS)} per line")
+    return episodes
+
+
+def _parse(line: str, towns: Sequence[str] | None) -> Episode:
+    try:
+        record = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not JSON ({error}); write one object with {', '.join(FIELDS)}") from None
+    if not isinstance(record, dict):
+        raise ValueError(f"{line[:80]!r} is no object; write one with {', '.join(FIELDS)}")
+    missing = [name for name in FIELDS if name not in record]
+    if missing:
+        raise ValueError(f"{', '.join(missing)} missing; an episode has {', '.join(FIELDS)}")
+    episode = Episode(**{name: record[name] for name in FIELDS})
+    if towns is not None and episode.town not in towns:
+        raise ValueError(f"unknown town {episode.town!r}; use one of {', '.join(towns)}")
+    return episode

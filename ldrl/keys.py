@@ -1,0 +1,65 @@
+"""Every TensorDict key of ldrl, once.
+
+The keys follow TorchRL's vision-language-action schema (:mod:`torchrl.data.vla`), so that its losses, validators
+and dataset tools work on ldrl data unchanged. Keys under ``"world"`` are privileged: only the expert, the labels,
+the camera and the metrics may read them. Keys under ``"agent"`` belong to the agent.
+"""
+
+from __future__ import annotations
+
+from torchrl.data.vla.schema import ACTION_KEY, IMAGE_KEY, INSTRUCTION_KEY
+
+__all__ = [
+    "ACTION",
+    "AGENT",
+    "COLLISION",
+    "CROSS_TRACK_ERROR",
+    "END_OF_SUBTASK",
+    "IMAGE",
+    "INSTRUCTION",
+    "INSTRUCTION_TOKENS",
+    "OFF_ROAD",
+    "POSE",
+    "PROGRESS",
+    "ROUTE",
+    "ROUTE_POSITION",
+    "SPEED",
+    "SUBTASK",
+    "WORLD",
+    "WRONG_LANE",
+]
+
+ACTION = ACTION_KEY
+"""Throttle in [0, 1] and steer in [-1, 1] (positive turns right), ``[*B, 2]`` float32."""
+IMAGE = IMAGE_KEY
+"""Dash camera image, ``[*B, C, 88, 200]`` uint8."""
+INSTRUCTION = INSTRUCTION_KEY
+"""The passenger's sentence, text; left out on hot paths."""
+INSTRUCTION_TOKENS = "instruction_tokens"
+"""The sentence as vocabulary indices, ``[*B, L]`` int64, 0 is padding."""
+SUBTASK = "subtask"
+"""Label: the sub-task that the route asks for here, ``[*B]`` int64."""
+END_OF_SUBTASK = "end_of_subtask"
+"""Label: whether the sub-task of the step before has ended, ``[*B]`` bool."""
+
+WORLD = "world"
+POSE = (WORLD, "pose")
+"""x, y (m) and heading (rad) of the vehicle's origin, ``[*B, 3]`` float32."""
+SPEED = (WORLD, "speed")
+"""Speed along the heading, ``[*B, 1]`` float32, m/s."""
+ROUTE = (WORLD, "route")
+"""Lanes of the route around the car: the previous, the current and those ahead, ``[*B, 6]`` int16."""
+ROUTE_POSITION = (WORLD, "route_position")
+"""Arc length from the start of the current lane to the car's projection, ``[*B, 1]`` float32, m."""
+PROGRESS = (WORLD, "progress")
+"""Distance driven along the route since the reset, ``[*B, 1]`` float32, m."""
+CROSS_TRACK_ERROR = (WORLD, "cross_track_error")
+"""Signed distance from the route's centre line, positive to its right, ``[*B, 1]`` float32, m."""
+OFF_ROAD = (WORLD, "off_road")
+"""Whether a corner of the footprint is off the drivable surface, ``[*B, 1]`` bool."""
+WRONG_LANE = (WORLD, "wrong_lane")
+"""Whether the footprint is in an oncoming lane outside junctions, ``[*B, 1]`` bool."""
+COLLISION = (WORLD, "collision")
+"""Whether the footprint touches a building, ``[*B, 1]`` bool."""
+
+AGENT = "agent"

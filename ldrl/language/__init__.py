@@ -1,0 +1,21 @@
+"""Language: keywords, sentences that say them, tokens and word vectors."""
+
+from __future__ import annotations
+
+from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
+from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
+from ldrl.language.tokens import PADDING, UNKNOWN, Tokenizer, normalise
+
+__all__ = [
+    "DIMENSIONS",
+    "KEYWORDS",
+    "PADDING",
+    "UNKNOWN",
+    "Glove",
+    "Keyword",
+    "Tokenizer",
+    "WordEmbedding",
+    "load_glove",
+    "normalise",
+    "realised_by",
+]

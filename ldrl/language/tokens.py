@@ -1,0 +1,110 @@
+"""From sentences to token ids."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
+
+import torch
+
+from ldrl.language.glove import SPECIAL_ROWS, Glove, load_glove
+
+__all__ = ["PADDING", "UNKNOWN", "Tokenizer", "normalise"]
+
+PADDING = 0
+"""Token id after the end of a sentence."""
+UNKNOWN = 1
+"""Token id of every word that GloVe does not have."""
+
+_WORD_OR_SYMBOL = re.compile(r"[^\W_]+|[^\w\s]")
+
+
+def normalise(sentence: str) -> list[str]:
+    """Splits a sentence into words as speech transcripts write them.
+
+    Lower case; apostrophes, hyphens and all other punctuation separate words and are dropped. An emoji or
+    another symbol outside ASCII is a word of its own, so that "⬅" is an instruction that nobody understands
+    rather than none.
+
+    Args:
+        sentence: any text.
+
+    Returns:
+        The words; empty where there is nothing but space and punctuation.
+
+    Examples:
+        >>> normalise("You're going to turn-left, OK?")
+        ['you', 're', 'going', 'to', 'turn', 'left', 'ok']
+    """
+    # NFKC first: accents join their letters and full-width letters become plain ones.
+    found = _WORD_OR_SYMBOL.findall(unicodedata.normalize("NFKC", sentence).lower())
+    return [word for word in found if word.isalnum() or _is_symbol(word)]
+
+
+def _is_symbol(character: str) -> bool:
+    # Not Sk, which modifies the character before: skin tones, free-standing accents.
+    return not character.isascii() and unicodedata.category(character) in ("So", "Sm", "Sc")
+
+
+class Tokenizer:
+    """Writes sentences as rows of token ids.
+
+    Id 0 is padding, 1 an unknown word, and ``r + 2`` the word of row ``r`` in GloVe. A sentence longer than
+    ``max_tokens`` keeps its first words; the longest template sentence fits. Unknown words that were kept are
+    counted in ``unknown``, so that a run can say what its passengers said in vain.
+
+    Args:
+        max_tokens: length of a row.
+        glove: the vocabulary; None for that of the package.
+
+    Raises:
+        ValueError: ``max_tokens`` is below 1.
+
+    Examples:
+        >>> tokenizer = Tokenizer(max_tokens=4)
+        >>> tokenizer(["Turn left!", "turn lefft"]).tolist()
+        [[892, 220, 0, 0], [892, 1, 0, 0]]
+        >>> tokenizer.unknown
+        Counter({'lefft': 1})
+    """
+
+    def __init__(self, max_tokens: int = 48, glove: Glove | None = None) -> None:
+        if max_tokens < 1:
+            raise ValueError(f"max_tokens is {max_tokens}: a sentence needs at least 1")
+        self.max_tokens = max_tokens
+        self.glove = load_glove() if glove is None else glove
+        self.unknown: Counter[str] = Counter()
+
+    def __call__(self, sentences: Sequence[str]) -> torch.Tensor:
+        """Tokenizes a batch.
+
+        Args:
+            sentences: B instructions; at least one word each.
+
+        Returns:
+            Token ids, ``[B, max_tokens]`` int64.
+
+        Raises:
+            TypeError: ``sentences`` is one string, not a sequence of them.
+            ValueError: a sentence has no word.
+        """
+        if isinstance(sentences, str):
+            raise TypeError(f"expected a sequence of sentences, got the string {sentences!r}: put it in a list")
+        rows = [self._row(sentence) for sentence in sentences]
+        return torch.tensor(rows, dtype=torch.int64).reshape(-1, self.max_tokens)
+
+    def _row(self, sentence: str) -> list[int]:
+        words = normalise(sentence)[: self.max_tokens]
+        if not words:
+            raise ValueError(f"the instruction {sentence!r} has no word: say what to do, for example 'turn left'")
+        vocabulary = self.glove.words
+        ids = [PADDING] * self.max_tokens
+        for position, word in enumerate(words):
+            if word in vocabulary:
+                ids[position] = vocabulary[word] + SPECIAL_ROWS
+            else:
+                ids[position] = UNKNOWN
+                self.unknown[word] += 1
+        return ids

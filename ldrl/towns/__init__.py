@@ -1,0 +1,18 @@
+"""Maps: street layouts, expanded into highway-env road networks, compiled into tensors; routes through them."""
+
+from ldrl.towns.layout import LAYOUTS, Layout, load_layout
+from ldrl.towns.routes import Route, UnrealisableError, match_route, plan_route, plan_routes
+from ldrl.towns.town import ROUTE_LANES, Town
+
+__all__ = [
+    "LAYOUTS",
+    "ROUTE_LANES",
+    "Layout",
+    "Route",
+    "Town",
+    "UnrealisableError",
+    "load_layout",
+    "match_route",
+    "plan_route",
+    "plan_routes",
+]

@@ -1,0 +1,87 @@
+"""The drivable surface of a town as rasters."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+__all__ = ["CELL", "MARGIN", "Surface", "rasterise", "sample"]
+
+CELL = 0.5
+"""Edge of a raster cell, m."""
+MARGIN = 8.0
+"""How far the rasters reach beyond the outermost lane, and the largest distance they tell, m."""
+
+
+class Surface(NamedTuple):
+    """Rasters over a town; cell ``[..., i, j]`` is centred at ``origin + CELL * (j, i)``.
+
+    Attributes:
+        origin: ``[2]`` float32, x and y of the first cell's centre, m.
+        road_distance: ``[1, 1, H, W]`` float32, signed distance to the edge of the road, negative on it, at most
+            ``MARGIN``, m.
+        nearest_point: ``[H, W]`` int64, index of the nearest centre-line point.
+    """
+
+    origin: Tensor
+    road_distance: Tensor
+    nearest_point: Tensor
+
+
+def rasterise(points: Tensor, headings: Tensor, half_width: float, spacing: float) -> Surface:
+    """Rasterise the union of bands around centre lines.
+
+    Args:
+        points: ``[P, 2]`` float32, samples of all centre lines, m.
+        headings: ``[P]`` float32, directions of the centre lines there, rad.
+        half_width: half the width of a band, m.
+        spacing: largest distance between neighbouring samples, m.
+
+    Returns:
+        The rasters. Each cell looks at the straight pieces through the samples within reach, so the distance is
+        exact to the curvature within half a spacing.
+    """
+    origin = points.amin(0) - MARGIN
+    width, height = ((points.amax(0) + MARGIN - origin) / CELL).ceil().int().add(1).tolist()
+    reach = math.ceil((half_width + MARGIN) / CELL)
+    steps = torch.arange(-reach, reach + 1)
+    window = torch.cartesian_prod(steps, steps).flip(-1)
+    distance = torch.full((height * width,), half_width + MARGIN)
+    nearest = torch.zeros(height * width, dtype=torch.long)
+    tangents = torch.stack((headings.cos(), headings.sin()), -1)
+    for rows in torch.arange(len(points)).split(256):
+        cells = ((points[rows] - origin) / CELL).round().int()[:, None] + window
+        offset = cells * CELL + origin - points[rows][:, None]
+        tangent = tangents[rows][:, None]
+        along = (offset * tangent).sum(-1, keepdim=True).clamp(-spacing / 2, spacing / 2)
+        value = (offset - along * tangent).norm(dim=-1)
+        inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
+        index = (cells[..., 1] * width + cells[..., 0])[inside].long()
+        value, source = value[inside], rows[:, None].expand_as(value)[inside]
+        distance.scatter_reduce_(0, index, value, "amin")
+        closest = value == distance[index]
+        nearest[index[closest]] = source[closest]
+    road_distance = (distance - half_width).clamp(max=MARGIN)
+    return Surface(origin, road_distance.view(1, 1, height, width), nearest.view(height, width))
+
+
+def sample(raster: Tensor, origin: Tensor, positions: Tensor, mode: str = "bilinear") -> Tensor:
+    """Read a raster at positions; outside it, its border value.
+
+    Args:
+        raster: ``[1, C, H, W]`` float32.
+        origin: ``[2]`` float32, see :class:`Surface`.
+        positions: ``[*B, 2]`` float32, m.
+        mode: ``"bilinear"`` or ``"nearest"``.
+
+    Returns:
+        ``[*B, C]`` float32.
+    """
+    size = torch.tensor(raster.shape[:-3:-1], device=raster.device)
+    grid = (positions - origin) * (2 / (CELL * (size - 1))) - 1
+    values = grid_sample(raster, grid.view(1, 1, -1, 2), mode, padding_mode="border", align_corners=True)
+    return values.view(raster.shape[1], -1).t().reshape(*positions.shape[:-1], -1)
