@@ -11,20 +11,30 @@ from torchrl.data.vla.schema import ACTION_KEY, IMAGE_KEY, INSTRUCTION_KEY
 
 __all__ = [
     "ACTION",
+    "AGE",
     "AGENT",
+    "AGENT_FINISH",
+    "AGENT_SUBTASK",
     "COLLISION",
     "CROSS_TRACK_ERROR",
+    "END_LOGIT",
     "END_OF_SUBTASK",
+    "HIGH_LEVEL_STATE",
     "IMAGE",
     "INSTRUCTION",
     "INSTRUCTION_TOKENS",
     "OFF_ROAD",
+    "PLANNED_TOKENS",
     "POSE",
+    "PREVIOUS_SUBTASK",
     "PROGRESS",
     "ROUTE",
     "ROUTE_POSITION",
     "SPEED",
     "SUBTASK",
+    "SUBTASK_LOGITS",
+    "SWITCH",
+    "VOTES",
     "WORLD",
     "WRONG_LANE",
 ]
@@ -63,3 +73,24 @@ COLLISION = (WORLD, "collision")
 """Whether the footprint touches a building, ``[*B, 1]`` bool."""
 
 AGENT = "agent"
+"""The agent's own keys; it reads the root's and writes those of the next step."""
+AGENT_SUBTASK = (AGENT, "subtask")
+"""The sub-task under way, ``[*B]`` int64."""
+PREVIOUS_SUBTASK = (AGENT, "previous_subtask")
+"""The sub-task before the one to decide on, ``[*B]`` int64, 5 at an instruction's first decision."""
+SUBTASK_LOGITS = (AGENT, "subtask_logits")
+"""The high-level policy's output, ``[*B, 5]`` float32."""
+HIGH_LEVEL_STATE = (AGENT, "high_level_state")
+"""The decoder's recurrent state, ``[*B, H]`` float32."""
+END_LOGIT = (AGENT, "end_logit")
+"""The end-of-sub-task policy's output, ``[*B, 1]`` float32."""
+VOTES = (AGENT, "votes")
+"""The three latest end-of-sub-task predictions, newest last, ``[*B, 3]`` bool."""
+AGE = (AGENT, "age")
+"""Steps since the sub-task was chosen, ``[*B]`` int64; 0 before the first decision."""
+PLANNED_TOKENS = (AGENT, "planned_tokens")
+"""Tokens of the instruction that the plan is for, ``[*B, L]`` int64."""
+SWITCH = (AGENT, "switch")
+"""Whether the high-level policy decides at this step, ``[*B]`` bool."""
+AGENT_FINISH = (AGENT, "finish")
+"""Whether the agent has declared the instruction done, ``[*B]`` bool."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
+from ldrl.language.sentences import Sentences, Split
 from ldrl.language.tokens import PADDING, UNKNOWN, Tokenizer, normalise
 
 __all__ = [
@@ -13,6 +14,8 @@ __all__ = [
     "UNKNOWN",
     "Glove",
     "Keyword",
+    "Sentences",
+    "Split",
     "Tokenizer",
     "WordEmbedding",
     "load_glove",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -43,7 +43,14 @@ class Glove:
     # Without the decorator torch.compile would trace the copy into every call.
     @torch.compiler.assume_constant_result
     def table_on(self, device: torch.device) -> torch.Tensor:
-        """Returns the table on a device, one copy per device and process."""
+        """Copies the table to a device, once per process.
+
+        Args:
+            device: where to.
+
+        Returns:
+            ``table`` on that device, ``[2 + V, 50]`` float32.
+        """
         return _copy(self, device)
 
     def embedding(self) -> WordEmbedding:
@@ -120,7 +127,7 @@ def load_glove(path: str | Path | None = None) -> Glove:
     return _load(None if path is None else Path(path).resolve())
 
 
-@lru_cache(maxsize=4)
+@cache
 def _load(path: Path | None) -> Glove:
     if path is None:
         words, vectors = _read_package()
@@ -133,7 +140,7 @@ def _load(path: Path | None) -> Glove:
     return Glove(words, table, path)
 
 
-@lru_cache(maxsize=4)
+@cache
 def _copy(glove: Glove, device: torch.device) -> torch.Tensor:
     return glove.table.to(device)
 

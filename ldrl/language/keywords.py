@@ -1,4 +1,4 @@
-"""The 14 keywords that instructions stand for, each an automaton over junctions (paper, section on language).
+"""The 14 keywords that instructions stand for, each an automaton over junctions.
 
 A sentence says one keyword. What that keyword asks for depends on the junctions that the car meets: "second left"
 passes one street on the left, however many junctions that takes. Planning routes, labelling states and finding

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache
 from importlib import resources
 from itertools import product
 from typing import Literal, get_args
@@ -42,7 +42,7 @@ class Sentences:
         >>> next(sentences.all("(second, left)"))
         'take the second left'
         >>> sentences.sample("left,right", random.Random(0))
-        ''
+        'um left and then right please'
     """
 
     def __init__(self, split: Split) -> None:
@@ -84,7 +84,7 @@ def _join(parts: Iterator[str] | tuple[str, ...]) -> str:
 _FILES = ("common", "single", "double", "ordinal")
 
 
-@lru_cache(maxsize=1)
+@cache
 def _templates() -> list[tuple[tuple[str, ...], list[dict[str, list[str]]]]]:
     """Reads each group: its keywords, and for each of its slots the parts by split."""
     folder = resources.files(__package__) / "templates"

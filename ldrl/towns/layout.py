@@ -27,8 +27,7 @@ __all__ = ["LAYOUTS", "Layout", "Node", "load_layout"]
 FOLDER = Path(__file__).parent / "layouts"
 LAYOUTS = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
 """The names of the layouts that come with the package."""
-SPEED_LIMIT = 20 / 3.6
-"""In m/s."""
+SPEED_LIMIT = 20 / 3.6  # m/s
 STRAIGHT_ON = math.radians(1.0)
 """Smaller turns are straight lanes, and junction arms may be this far from perpendicular."""
 
@@ -82,17 +81,17 @@ class Layout:
         data: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         keys = {"name", "lane_width", "nodes", "streets"}
         if not isinstance(data, dict) or set(data) != keys:
-            raise ValueError(f"layout {path}: expected exactly the keys {sorted(keys)}, got {data!r:.200}")
+            raise ValueError(f"layout {path}: expected exactly the keys {sorted(keys)}, got {data!s:.200}")
         name, nodes, streets = data["name"], data["nodes"], data["streets"]
         if not isinstance(nodes, dict):
-            raise ValueError(f"layout {name!r}: nodes must map names to [x, y, radius], got {nodes!r:.200}")
+            raise ValueError(f"layout {name!r}: nodes must map names to [x, y, radius], got {nodes!s:.200}")
         for node, values in nodes.items():
             if not isinstance(values, list) or len(values) != 3:
                 raise ValueError(f"layout {name!r}: node {node!r} is {values!r}; write [x, y, radius]")
         if not isinstance(streets, list) or not all(isinstance(street, list) for street in streets):
-            raise ValueError(f"layout {name!r}: streets must be a list of lists of node names, got {streets!r:.200}")
-        places = {node: Node(*values) for node, values in nodes.items()}
-        return cls(name, data["lane_width"], places, tuple(map(tuple, streets)))
+            raise ValueError(f"layout {name!r}: streets must be a list of lists of node names, got {streets!s:.200}")
+        nodes = {node: Node(*values) for node, values in nodes.items()}
+        return cls(name, data["lane_width"], nodes, tuple(map(tuple, streets)))
 
     def network(self) -> RoadNetwork:
         """Expand the layout.
@@ -138,14 +137,12 @@ class Layout:
     def _lane_end(self, node: str, arm: str, side: int) -> np.ndarray:
         """Where a lane of an arm ends near the node: for ``side`` 1 the one that leaves it, for -1 the other."""
         heading, along, across = self._heading(node, arm), self._setback(node), side * self.lane_width / 2
-        cos, sin = math.cos(heading), math.sin(heading)
-        x, y, _ = self.nodes[node]
+        (x, y, _), cos, sin = self.nodes[node], math.cos(heading), math.sin(heading)
         return np.array((x + along * cos - across * sin, y + along * sin + across * cos))
 
     def _street_lane(self, a: str, b: str, centre_line: int) -> AbstractLane:
-        lines = (centre_line, LineType.CONTINUOUS)
         ends = self._lane_end(a, b, side=1), self._lane_end(b, a, side=-1)
-        lane = StraightLane(*ends, width=self.lane_width, line_types=lines, speed_limit=SPEED_LIMIT)
+        lane = StraightLane(*ends, self.lane_width, (centre_line, LineType.CONTINUOUS), speed_limit=SPEED_LIMIT)
         lane.manoeuvre = SubTask.LANEFOLLOW
         return lane
 
@@ -178,8 +175,8 @@ class Layout:
                 if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                     raise self._error(f"node {name!r} and lane_width: {value!r} is no number; write metres")
             if not 0 < self.lane_width <= node.radius:
-                got = f"{self.lane_width} and {node.radius}"
-                raise self._error(f"node {name!r}: 0 < lane_width <= radius must hold, got {got}; enlarge the radius")
+                wanted = f"at least lane_width {self.lane_width} > 0"
+                raise self._error(f"node {name!r}: radius {node.radius} must be {wanted}; enlarge it")
 
     def _check_blocks(self) -> None:
         for i, (a, b) in enumerate(self._blocks):

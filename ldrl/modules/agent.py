@@ -1,0 +1,168 @@
+"""The hierarchical agent: the paper's figure as one policy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from ldrl import keys
+from ldrl.modules.controller import VOTES, SwitchingController
+from ldrl.modules.high_level import HighLevelPolicy
+from ldrl.modules.low_level import LowLevelPolicy
+from ldrl.subtasks import SubTask
+
+__all__ = ["AgentConfig", "HierarchicalAgent"]
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Sizes of the agent; the defaults are small enough for two CPU cores, :meth:`paper` gives the paper's.
+
+    Args:
+        image_channels: 1 for road segmentation.
+        conv_channels: of each image encoder's convolutions.
+        features: size of each linear layer behind an image encoder.
+        low_level_hidden: size of a low-level GRU; there are four in each of the two networks.
+        instruction_hidden: size of the instruction's GRU.
+        subtask_embedding: size of the previous sub-task's embedding.
+        high_level_hidden: size of the high-level GRU.
+        max_tokens: longest instruction, in words.
+    """
+
+    image_channels: int = 1
+    conv_channels: tuple[int, int, int] = (16, 32, 32)
+    features: int = 128
+    low_level_hidden: int = 64
+    instruction_hidden: int = 32
+    subtask_embedding: int = 16
+    high_level_hidden: int = 128
+    max_tokens: int = 48
+
+    @classmethod
+    def paper(cls) -> AgentConfig:
+        """The sizes of the paper's implementation."""
+        return cls(
+            conv_channels=(256, 64, 64),
+            features=256,
+            low_level_hidden=256,
+            subtask_embedding=64,
+            high_level_hidden=256,
+        )
+
+
+class HierarchicalAgent(TensorDictModuleBase):
+    """Language and image in, throttle and steer out: high-level policy, low-level policies, switching controller.
+
+    All parts are attributes and may be replaced by modules with the same keys. The agent's memory lies in the
+    TensorDict under ``"agent"``: :meth:`make_tensordict_primer` gives the transform that an env needs to hold it.
+    A call is one step of a batch of cars; only rows that switch run the high-level policy.
+
+    Args:
+        config: sizes.
+
+    Examples:
+        >>> from ldrl.envs import make_env
+        >>> agent = HierarchicalAgent()
+        >>> env = make_env("town1", num_cars=2, agent=agent, seed=0)
+        >>> env.rollout(3, agent)["action"].shape
+        torch.Size([2, 3, 2])
+    """
+
+    def __init__(self, config: AgentConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = AgentConfig() if config is None else config
+        image = {"in_channels": config.image_channels, "channels": config.conv_channels, "features": config.features}
+        low = {**image, "hidden": config.low_level_hidden}
+        self.high_level = HighLevelPolicy(
+            **image,
+            instruction=config.instruction_hidden,
+            embedding=config.subtask_embedding,
+            hidden=config.high_level_hidden,
+        )
+        self.control = LowLevelPolicy("control", keys.ACTION, 2, **low)
+        self.end_of_subtask = LowLevelPolicy("end", keys.END_LOGIT, 1, **low)
+        self.controller = SwitchingController()
+        self.in_keys = [keys.IMAGE, keys.INSTRUCTION_TOKENS, *self._memory]
+        self.out_keys = [
+            keys.ACTION, keys.AGENT_SUBTASK, keys.AGENT_FINISH, keys.SWITCH, *(("next", *key) for key in self._memory)
+        ]  # fmt: skip
+
+    @property
+    def _memory(self) -> dict[tuple[str, ...], TensorSpec]:
+        """Key and spec of everything that the agent remembers, for one car."""
+        return {
+            keys.AGENT_SUBTASK: Categorical(len(SubTask), ()),
+            keys.VOTES: Bounded(0, 1, (VOTES,), dtype=torch.bool),
+            keys.AGE: Unbounded((), dtype=torch.int64),
+            keys.PLANNED_TOKENS: Unbounded((self.config.max_tokens,), dtype=torch.int64),
+            keys.HIGH_LEVEL_STATE: Unbounded((self.high_level.hidden,)),
+            self.control.state_key: Unbounded((self.control.hidden,)),
+            self.end_of_subtask.state_key: Unbounded((self.end_of_subtask.hidden,)),
+        }
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that gives an env's TensorDict the agent's memory, zero at each reset."""
+        memory = Composite()
+        for key, spec in self._memory.items():
+            memory[key] = spec
+        return TensorDictPrimer(memory, expand_specs=True)
+
+    @torch.no_grad()
+    def decide(self, tensordict: TensorDictBase) -> None:
+        """Ask the high-level policy in the rows that switch."""
+        switch = tensordict[keys.SWITCH]
+        tensordict["next", *keys.HIGH_LEVEL_STATE] = tensordict[keys.HIGH_LEVEL_STATE].clone()
+        tensordict[keys.AGENT_SUBTASK] = tensordict[keys.AGENT_SUBTASK].clone()
+        rows = switch.nonzero().squeeze(-1)
+        if not len(rows):
+            return
+        asked = tensordict.select(*self.high_level.in_keys)[rows]
+        self.high_level(asked)
+        tensordict[keys.AGENT_SUBTASK][rows] = asked[keys.SUBTASK_LOGITS].argmax(-1)
+        tensordict["next", *keys.HIGH_LEVEL_STATE][rows] = asked["next", *keys.HIGH_LEVEL_STATE]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """One step.
+
+        Args:
+            tensordict: batch size ``[B]`` with ``in_keys``.
+
+        Returns:
+            The same, with ``action``, ``("agent", "subtask")``, ``("agent", "finish")`` and the memory for the next
+            step under ``("next", "agent")``.
+
+        Raises:
+            KeyError: the memory is missing: the env lacks :meth:`make_tensordict_primer`.
+        """
+        missing = [key for key in self._memory if key not in tensordict.keys(True, True)]
+        if missing:
+            raise KeyError(f"{missing[0]} is missing; append agent.make_tensordict_primer() to the env")
+        if tensordict.batch_dims == 0:
+            return tensordict.update(self(tensordict.unsqueeze(0)).squeeze(0))
+        memory = tensordict.select(*self.in_keys)
+        self.controller(memory)
+        self.decide(memory)
+        keep = ~memory[keys.SWITCH]
+        for policy in (self.control, self.end_of_subtask):
+            memory[policy.state_key] = memory[policy.state_key] * keep.unsqueeze(-1)
+            policy(memory)
+        subtask = memory[keys.AGENT_SUBTASK]
+        finish = subtask == SubTask.FINISH
+        throttle, steer = memory[keys.ACTION].unbind(-1)
+        vote = memory[keys.END_LOGIT] > 0
+        after = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+        after[keys.ACTION] = torch.stack((throttle.clamp(0, 1) * ~finish, steer.clamp(-1, 1)), -1)
+        after[keys.AGENT_SUBTASK] = subtask
+        after[keys.AGENT_FINISH] = finish
+        after[keys.SWITCH] = memory[keys.SWITCH]
+        after["next"] = memory["next"]
+        after["next", *keys.AGENT_SUBTASK] = subtask
+        after["next", *keys.VOTES] = torch.cat((memory[keys.VOTES][..., 1:] & keep.unsqueeze(-1), vote), -1)
+        after["next", *keys.AGE] = memory[keys.AGE] * keep + 1
+        after["next", *keys.PLANNED_TOKENS] = memory[keys.PLANNED_TOKENS]
+        return tensordict.update(after)

@@ -1,0 +1,61 @@
+"""Attention: over the words of the instruction, and over the channels of the image."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+__all__ = ["GatedAttention", "LuongAttention"]
+
+
+class LuongAttention(nn.Module):
+    """Luong et al. (2015), general score: ``linear(encoder state) . decoder state``.
+
+    Args:
+        encoder: size of an encoder state.
+        decoder: size of the decoder state.
+    """
+
+    def __init__(self, encoder: int, decoder: int) -> None:
+        super().__init__()
+        self.score = nn.Linear(encoder, decoder, bias=False)
+
+    def forward(self, states: Tensor, is_word: Tensor, decoder: Tensor) -> Tensor:
+        """Attend to words.
+
+        Args:
+            states: encoder states, ``[*B, L, E]`` float32.
+            is_word: ``[*B, L]`` bool; False is left out.
+            decoder: decoder state, ``[*B, D]`` float32.
+
+        Returns:
+            ``[*B, E]`` float32, the weighted mean of the states; zero where there is no word.
+        """
+        score = (self.score(states) @ decoder.unsqueeze(-1)).squeeze(-1)
+        # A large finite number, so that a row without words has weights and no NaN.
+        weights = score.masked_fill(~is_word, -1e9).softmax(-1) * is_word
+        return (weights.unsqueeze(-2) @ states).squeeze(-2)
+
+
+class GatedAttention(nn.Module):
+    """Chaplot et al. (2018): one weight per image channel from the instruction, multiplied in.
+
+    Args:
+        condition: size of the instruction vector.
+        channels: channels of the image features.
+    """
+
+    def __init__(self, condition: int, channels: int) -> None:
+        super().__init__()
+        self.gate = nn.Linear(condition, channels)
+
+    def forward(self, features: Tensor, condition: Tensor) -> Tensor:
+        """Gate features.
+
+        Args:
+            features: ``[*B, C, H, W]`` float32.
+            condition: ``[*B, N]`` float32.
+
+        Returns:
+            ``[*B, C, H, W]`` float32.
+        """
+        return features * self.gate(condition).sigmoid()[..., None, None]

@@ -1,0 +1,86 @@
+"""Encoders of the two inputs: the image and the instruction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
+
+from ldrl.language import PADDING, WordEmbedding
+
+__all__ = ["ImageEncoder", "InstructionEncoder"]
+
+KERNELS = ((8, 4), (4, 2), (4, 2))
+"""Kernel size and stride of each convolution (paper's implementation); 88x200 becomes 3x10."""
+
+
+class ImageEncoder(nn.Module):
+    """Three convolutions with ELU.
+
+    Args:
+        in_channels: channels of the image.
+        channels: channels after each convolution.
+
+    Examples:
+        >>> ImageEncoder(1, (4, 4, 8))(torch.zeros(2, 5, 1, 88, 200, dtype=torch.uint8)).shape
+        torch.Size([2, 5, 8, 3, 10])
+    """
+
+    def __init__(self, in_channels: int, channels: Sequence[int]) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for width, (kernel, stride) in zip(channels, KERNELS, strict=True):
+            layers += [nn.Conv2d(in_channels, width, kernel, stride), nn.ELU()]
+            in_channels = width
+        # Channels last trains more than twice as fast on a CPU.
+        self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Encode images.
+
+        Args:
+            image: ``[*B, C, 88, 200]`` uint8.
+
+        Returns:
+            ``[*B, C', 3, 10]`` float32.
+        """
+        flat = image.reshape(-1, *image.shape[-3:]).to(self.layers[0].weight.dtype).div_(255)
+        features = self.layers(flat.contiguous(memory_format=torch.channels_last))
+        return features.reshape(*image.shape[:-3], *features.shape[1:])
+
+
+class InstructionEncoder(nn.Module):
+    """Frozen GloVe vectors through a single-layer GRU.
+
+    Args:
+        hidden: size of the GRU's state.
+
+    Examples:
+        >>> states, is_word = InstructionEncoder(32)(torch.tensor([[5, 6, 0, 0]]))
+        >>> states.shape, is_word
+        (torch.Size([1, 4, 32]), tensor([[ True,  True, False, False]]))
+    """
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.embedding = WordEmbedding()
+        self.gru = nn.GRU(50, hidden, batch_first=True)
+
+    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode instructions.
+
+        Args:
+            tokens: ``[*B, L]`` int64, 0 is padding and only at the end.
+
+        Returns:
+            The GRU's state after each word, ``[*B, L, hidden]`` float32, zero for padding, and where there is a
+            word, ``[*B, L]`` bool.
+        """
+        flat = tokens.reshape(-1, tokens.shape[-1])
+        is_word = flat != PADDING
+        length = is_word.sum(-1).clamp(min=1).cpu()
+        packed = pack_padded_sequence(self.embedding(flat), length, batch_first=True, enforce_sorted=False)
+        states, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=tokens.shape[-1])
+        return states.view(*tokens.shape, -1), is_word.view(tokens.shape)

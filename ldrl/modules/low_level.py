@@ -1,0 +1,99 @@
+"""Low-level policies: one network steers and gives gas, another reports the end of the sub-task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.modules import recurrent_mode
+
+from ldrl import keys
+from ldrl.modules.encoders import ImageEncoder
+from ldrl.subtasks import LOW_LEVEL, SubTask
+
+__all__ = ["BranchedGRU", "LowLevelPolicy"]
+
+
+class BranchedGRU(nn.Module):
+    """One GRU per sub-task, chosen by the sub-task.
+
+    Under :class:`torchrl.modules.set_recurrent_mode` the inputs carry a time dimension after the batch's and are run
+    as sequences; else each call is one step.
+
+    Args:
+        inputs: size of an input.
+        hidden: size of the state.
+    """
+
+    def __init__(self, inputs: int, hidden: int) -> None:
+        super().__init__()
+        self.branches = nn.ModuleList(nn.GRU(inputs, hidden, batch_first=True) for _ in LOW_LEVEL)
+
+    def forward(self, features: Tensor, subtask: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Run the branches.
+
+        Args:
+            features: ``[B, (T,) F]`` float32.
+            subtask: ``[B, (T)]`` int64, the same along time; ``FINISH`` takes the branch of ``LANEFOLLOW``.
+            state: ``[B, (T,) H]`` float32; of a sequence the first counts.
+
+        Returns:
+            Outputs and states after each step, both ``[B, (T,) H]`` float32.
+        """
+        sequence = recurrent_mode()
+        if sequence:
+            subtask, state = subtask[:, 0], state[:, 0]
+        else:
+            features = features.unsqueeze(1)
+        out = features.new_empty(*features.shape[:2], state.shape[-1])
+        branch = subtask.clamp(max=SubTask.LANEFOLLOW)
+        for index, gru in enumerate(self.branches):
+            rows = (branch == index).nonzero().squeeze(-1)
+            if len(rows):
+                out[rows] = gru(features[rows], state[rows].unsqueeze(0))[0].to(out.dtype)
+        if not sequence:
+            out = out.squeeze(1)
+        return out, out
+
+
+class LowLevelPolicy(TensorDictSequential):
+    """Image to convolutions, a linear layer with ELU, one GRU per sub-task, and a linear head (paper, section 3.2).
+
+    Args:
+        name: of the network; its state and features are ``("agent", name, ...)``.
+        out_key: where the head writes.
+        outputs: size of the head.
+        in_channels: channels of the image.
+        channels: of the convolutions.
+        features: size of the linear layer.
+        hidden: size of each GRU.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        out_key: NestedKey,
+        outputs: int,
+        *,
+        in_channels: int,
+        channels: Sequence[int],
+        features: int,
+        hidden: int,
+    ) -> None:
+        self.hidden = hidden
+        self.state_key = (keys.AGENT, f"{name}_state")
+        image, encoded, decoded = ((keys.AGENT, f"{name}_{part}") for part in ("image", "features", "decoded"))
+        flat = channels[-1] * 3 * 10
+        super().__init__(
+            TensorDictModule(ImageEncoder(in_channels, channels), [keys.IMAGE], [image]),
+            TensorDictModule(nn.Sequential(nn.Flatten(-3), nn.Linear(flat, features), nn.ELU()), [image], [encoded]),
+            TensorDictModule(
+                BranchedGRU(features, hidden),
+                [encoded, keys.AGENT_SUBTASK, self.state_key],
+                [decoded, ("next", *self.state_key)],
+            ),
+            TensorDictModule(nn.Linear(hidden, outputs), [decoded], [out_key]),
+            selected_out_keys=[out_key, ("next", *self.state_key)],
+        )
