@@ -12,19 +12,16 @@ from ldrl import keys
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
 
-__all__ = ["APPROACH", "DEPARTURE", "SubtaskLabels", "route_subtask"]
+__all__ = ["APPROACH", "SubtaskLabels", "route_subtask"]
 
 APPROACH = 6.0
 """A manoeuvre begins this far before its junction, m."""
-DEPARTURE = 3.0
-"""A manoeuvre ends this far behind its junction, m."""
 
 
 def route_subtask(town: Town, route: Tensor, position: Tensor) -> Tensor:
     """The sub-task that a route asks for.
 
-    A manoeuvre lasts from 6 m before its junction to 3 m behind it; all between is lane following. Where two overlap
-    the one ahead counts.
+    A manoeuvre lasts from 6 m before its junction to the junction's exit; all between is lane following.
 
     Args:
         town: the town.
@@ -39,12 +36,10 @@ def route_subtask(town: Town, route: Tensor, position: Tensor) -> Tensor:
     manoeuvres = town.lane_manoeuvre[route.long()]
     ahead = torch.arange(route.shape[-1], device=route.device) > window
     following = ((manoeuvres != SubTask.LANEFOLLOW) & ahead).int().argmax(-1, keepdim=True)
-    before = manoeuvres.gather(-1, (window - 1).clamp(min=0))
     here = manoeuvres.gather(-1, window)
     to_junction = town.lane_length[lane] - along + town.lane_to_junction[lane]
-    subtask = torch.where(along < DEPARTURE, before, SubTask.LANEFOLLOW)
-    subtask = torch.where(to_junction <= APPROACH, manoeuvres.gather(-1, following), subtask)
-    return torch.where(here == SubTask.LANEFOLLOW, subtask, here).squeeze(-1)
+    coming = torch.where(to_junction <= APPROACH, manoeuvres.gather(-1, following), SubTask.LANEFOLLOW)
+    return torch.where(here == SubTask.LANEFOLLOW, coming, here).squeeze(-1)
 
 
 class SubtaskLabels(Transform):

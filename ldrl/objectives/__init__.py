@@ -1,0 +1,5 @@
+"""Losses."""
+
+from ldrl.objectives.imitation import ControlLoss, EndOfSubtaskLoss, SubtaskLoss
+
+__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SubtaskLoss"]

@@ -1,0 +1,165 @@
+"""Imitation losses of the three networks (paper, section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.nn import functional
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import LossModule
+
+from ldrl import keys
+from ldrl.modules import HighLevelPolicy, LowLevelPolicy
+
+__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SubtaskLoss"]
+
+
+class _LowLevelLoss(LossModule):
+    """A loss over slices of one low-level policy, which starts each slice from a zero state."""
+
+    policy: TensorDictModuleBase
+    policy_params: TensorDictParams
+
+    def __init__(self, policy: LowLevelPolicy) -> None:
+        super().__init__()
+        self._in_keys = None
+        self.state_key, self.hidden = policy.state_key, policy.hidden
+        self.convert_to_functional(policy, "policy", create_target_params=False)
+
+    def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
+        inputs = tensordict.select(keys.IMAGE)
+        inputs[keys.AGENT_SUBTASK] = tensordict[self.tensor_keys.subtask]
+        inputs[self.state_key] = torch.zeros(*tensordict.shape, self.hidden, device=tensordict.device)
+        with self.policy_params.to_module(self.policy), set_recurrent_mode(True):
+            return self.policy(inputs)
+
+
+class ControlLoss(_LowLevelLoss):
+    """L1 between the control policy's action and the expert's.
+
+    Args:
+        policy: the control policy.
+
+    Examples:
+        >>> from ldrl.modules import HierarchicalAgent
+        >>> loss = ControlLoss(HierarchicalAgent().control)
+        >>> data = TensorDict({"action": torch.zeros(2, 5, 2), "subtask": torch.zeros(2, 5, dtype=torch.long)}, [2, 5])
+        >>> data["observation", "image"] = torch.zeros(2, 5, 1, 88, 200, dtype=torch.uint8)
+        >>> loss(data)["loss_control"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        action: NestedKey = keys.ACTION
+        subtask: NestedKey = keys.SUBTASK
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_control"]  # noqa: RUF012
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss.
+
+        Args:
+            tensordict: slices, batch size ``[B, T]``: image, ``subtask`` and ``action``.
+
+        Returns:
+            ``loss_control``, a scalar.
+        """
+        loss = functional.l1_loss(self._run(tensordict)[keys.ACTION], tensordict[self.tensor_keys.action])
+        return TensorDict({"loss_control": loss})
+
+
+class EndOfSubtaskLoss(_LowLevelLoss):
+    """Binary cross entropy of the end-of-sub-task policy.
+
+    Args:
+        policy: the end-of-sub-task policy.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        end_of_subtask: NestedKey = keys.END_OF_SUBTASK
+        subtask: NestedKey = keys.SUBTASK
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_end_of_subtask"]  # noqa: RUF012
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss.
+
+        Args:
+            tensordict: slices, batch size ``[B, T]``: image, ``subtask`` and ``end_of_subtask``.
+
+        Returns:
+            ``loss_end_of_subtask``, a scalar, and ``accuracy``, the share of steps decided right.
+        """
+        logit = self._run(tensordict)[keys.END_LOGIT].squeeze(-1)
+        ended = tensordict[self.tensor_keys.end_of_subtask]
+        loss = functional.binary_cross_entropy_with_logits(logit, ended.float())
+        accuracy = ((logit > 0) == ended).float().mean()
+        return TensorDict({"loss_end_of_subtask": loss, "accuracy": accuracy})
+
+
+class SubtaskLoss(LossModule):
+    """Cross entropy of the high-level policy over sequences of decisions; padding counts for nothing.
+
+    Args:
+        policy: the high-level policy.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        subtask: NestedKey = keys.SUBTASK
+        mask: NestedKey = "mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_subtask"]  # noqa: RUF012
+    policy: TensorDictModuleBase
+    policy_params: TensorDictParams
+
+    def __init__(self, policy: HighLevelPolicy) -> None:
+        super().__init__()
+        self._in_keys = None
+        self.hidden = policy.hidden
+        self.convert_to_functional(policy, "policy", create_target_params=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss.
+
+        Args:
+            tensordict: sequences of decisions, batch size ``[B, D]``: image, instruction tokens, ``("agent",
+            "previous_subtask")``, the right ``subtask``, and ``mask``, False for padding, which is at the end.
+
+        Returns:
+            ``loss_subtask``, a scalar, zero where all is padding, and ``accuracy``, the share of decisions made right.
+        """
+        mask, target = tensordict[self.tensor_keys.mask], tensordict[self.tensor_keys.subtask]
+        logits = self._decide(tensordict, mask)
+        target = torch.cat([target[rows, step] for step, rows in enumerate(mask.unbind(1))])
+        decisions = max(len(target), 1)
+        loss = functional.cross_entropy(logits, target, reduction="sum") / decisions
+        accuracy = (logits.argmax(-1) == target).float().sum() / decisions
+        return TensorDict({"loss_subtask": loss, "accuracy": accuracy})
+
+    def _decide(self, tensordict: TensorDictBase, mask: Tensor) -> Tensor:
+        """Logits of all decisions that are not padding, step by step: ``[mask.sum(), 5]``."""
+        state = torch.zeros(len(tensordict), self.hidden, device=tensordict.device)
+        logits = []
+        with self.policy_params.to_module(self.policy):
+            for step, rows in enumerate(mask.unbind(1)):
+                inputs = tensordict[:, step].select(keys.IMAGE, keys.INSTRUCTION_TOKENS, keys.PREVIOUS_SUBTASK)[rows]
+                inputs[keys.HIGH_LEVEL_STATE] = state[rows]
+                if len(inputs):
+                    self.policy(inputs)
+                    logits.append(inputs[keys.SUBTASK_LOGITS])
+                    state = state.index_put((rows,), inputs["next", *keys.HIGH_LEVEL_STATE])
+        return torch.cat(logits) if logits else state.new_zeros(0, 5)
