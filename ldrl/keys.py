@@ -28,6 +28,7 @@ __all__ = [
     "POSE",
     "PREVIOUS_SUBTASK",
     "PROGRESS",
+    "REMAINING",
     "ROUTE",
     "ROUTE_POSITION",
     "SPEED",
@@ -63,6 +64,8 @@ ROUTE_POSITION = (WORLD, "route_position")
 """Arc length from the start of the current lane to the car's projection, ``[*B, 1]`` float32, m."""
 PROGRESS = (WORLD, "progress")
 """Distance driven along the route since the reset, ``[*B, 1]`` float32, m."""
+REMAINING = (WORLD, "remaining")
+"""Distance left to the end of the episode's path, infinite when roaming, ``[*B, 1]`` float32, m."""
 CROSS_TRACK_ERROR = (WORLD, "cross_track_error")
 """Signed distance from the route's centre line, positive to its right, ``[*B, 1]`` float32, m."""
 OFF_ROAD = (WORLD, "off_road")

@@ -53,6 +53,8 @@ def expert_action(town: Town, pose: Tensor, speed: Tensor, route: Tensor, positi
 class Expert(TensorDictModuleBase):
     """The expert as a policy; reads ``("world", ...)``, which no trained policy may.
 
+    At the end of an episode's path it declares ``("agent", "finish")`` and rolls to a stop.
+
     Args:
         town: the town that the cars drive in.
 
@@ -65,8 +67,8 @@ class Expert(TensorDictModuleBase):
         False
     """
 
-    in_keys = [keys.POSE, keys.SPEED, keys.ROUTE, keys.ROUTE_POSITION]  # noqa: RUF012
-    out_keys = [keys.ACTION]  # noqa: RUF012
+    in_keys = [keys.POSE, keys.SPEED, keys.ROUTE, keys.ROUTE_POSITION, keys.REMAINING]  # noqa: RUF012
+    out_keys = [keys.ACTION, keys.AGENT_FINISH]  # noqa: RUF012
 
     def __init__(self, town: Town) -> None:
         super().__init__()
@@ -74,6 +76,9 @@ class Expert(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        pose, speed, route, position = (tensordict[key] for key in self.in_keys)
-        tensordict[keys.ACTION] = expert_action(self.town, pose, speed.squeeze(-1), route, position.squeeze(-1))
+        pose, speed, route, position, remaining = (tensordict[key] for key in self.in_keys)
+        throttle, steer = expert_action(self.town, pose, speed.squeeze(-1), route, position.squeeze(-1)).unbind(-1)
+        finish = remaining.squeeze(-1) <= 0
+        tensordict[keys.ACTION] = torch.stack((throttle * ~finish, steer), -1)
+        tensordict[keys.AGENT_FINISH] = finish
         return tensordict

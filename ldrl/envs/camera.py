@@ -83,13 +83,14 @@ class DashCamera(Transform):
         pose = shift(pose, self.lateral, self.yaw)
         images = pose.new_zeros((pose[..., 0].numel(), 1, HEIGHT, WIDTH), dtype=torch.uint8)
         below_horizon = images[:, :, HEIGHT // 2 :]
-        for chunk, target in zip(pose.reshape(-1, 3).split(FRAMES_AT_ONCE), below_horizon.split(FRAMES_AT_ONCE), strict=True):
+        chunks = pose.reshape(-1, 3).split(FRAMES_AT_ONCE)
+        for chunk, target in zip(chunks, below_horizon.split(FRAMES_AT_ONCE), strict=True):
             target.copy_(self._on_road(chunk))
         return images.mul_(255).view(*pose.shape[:-1], 1, HEIGHT, WIDTH)
 
     def _on_road(self, pose: Tensor) -> Tensor:
         """Whether the rays below the horizon meet the road: ``[N, 1, 44, 200]`` bool."""
-        raster = self.town.road_distance
+        raster = self.town.road_distance.expand(len(pose), -1, -1, -1)
         height, width = raster.shape[-2:]
         cos, sin = pose[:, 2].cos(), pose[:, 2].sin()
         # A ray (forward, right, 1) times this matrix is the raster coordinate that grid_sample reads, in [-1, 1].
@@ -97,11 +98,8 @@ class DashCamera(Transform):
         matrix = torch.cat((axes, (pose[:, :2] - self.town.raster_origin).unsqueeze(1)), 1)
         matrix = matrix * (2 / CELL / matrix.new_tensor([width - 1, height - 1]))
         grid = self.rays @ matrix
-        grid -= grid.new_tensor([1.0, 1.0])
-        distance = grid_sample(
-            raster.expand(len(pose), -1, -1, -1), grid.view(-1, HEIGHT // 2, WIDTH, 2), padding_mode="border", align_corners=True
-        )
-        return distance < 0
+        grid = grid.sub_(1).view(-1, HEIGHT // 2, WIDTH, 2)
+        return grid_sample(raster, grid, padding_mode="border", align_corners=True) < 0
 
     def _apply_transform(self, pose: Tensor) -> Tensor:
         return self.draw(pose)

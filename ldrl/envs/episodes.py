@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -75,10 +74,14 @@ class Episode:
 
 
 def _numbers(name: str, value: object, count: int) -> tuple:
-    right = isinstance(value, list | tuple) and len(value) == count
-    if not right or not all(isinstance(v, int | float) and math.isfinite(v) for v in value):  # type: ignore[union-attr]
-        raise ValueError(f"{name} is {value!r}; give {count} finite numbers")
-    return tuple(float(v) for v in value)  # type: ignore[union-attr]
+    if not isinstance(value, list | tuple) or len(value) != count or not all(map(_is_finite, value)):
+        raise ValueError(f"{name} is {value!r:.200}; give {count} finite numbers")
+    return tuple(map(float, value))
+
+
+def _is_finite(value: object) -> bool:
+    # Not bool, which Python takes for a number, and no integer too large for a float.
+    return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
 
 
 def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout", seed: int = 0) -> list[Episode]:
@@ -147,7 +150,11 @@ def load_episodes(path: str | Path, towns: Sequence[str] | None = None) -> list[
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no episode file {str(path)!r}; give a JSON-lines file or 'builtin'")
     episodes = []
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 ({error}); write JSON lines in UTF-8") from None
+    for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: it cuts at U+2028 inside a string
         if not line.strip():
             continue
         try:

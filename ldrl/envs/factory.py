@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 
+from ldrl import keys
 from ldrl.envs.camera import DashCamera
 from ldrl.envs.episodes import Episode
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
 from ldrl.envs.town import TownEnv
-from ldrl.language import Tokenizer
 from ldrl.towns import Town
-
-if TYPE_CHECKING:
-    from ldrl.modules import HierarchicalAgent
 
 __all__ = ["make_env"]
 
@@ -27,8 +24,7 @@ def make_env(
     num_cars: int | None = None,
     *,
     episodes: Sequence[Episode] | None = None,
-    agent: HierarchicalAgent | None = None,
-    camera: bool = True,
+    policy: TensorDictModuleBase | None = None,
     max_steps: int = 1000,
     device: torch.device | str = "cpu",
     seed: int = 0,
@@ -39,8 +35,7 @@ def make_env(
         town: a town or the name of one.
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: one per row, with their instructions; None roams and draws training sentences.
-        agent: whose memory the env is to hold.
-        camera: whether to draw images.
+        policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         max_steps: length of a roaming episode.
         device: where the tensors are.
         seed: of the env and of the instructions.
@@ -51,11 +46,10 @@ def make_env(
     """
     town = Town.load(town) if isinstance(town, str) else town
     env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, device=device, seed=seed)
-    tokenizer = Tokenizer() if agent is None else Tokenizer(agent.config.max_tokens)
     said = None if episodes is None else [episode.instruction for episode in episodes]
-    transforms = [SubtaskLabels(town), Instruction(said, tokenizer=tokenizer, seed=seed)]
-    if camera:
+    transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
+    if policy is None or keys.IMAGE in policy.in_keys:
         transforms.append(DashCamera(town).to(device))
-    if agent is not None:
-        transforms.append(agent.make_tensordict_primer())
+    if hasattr(policy, "make_tensordict_primer"):
+        transforms.append(policy.make_tensordict_primer())
     return TransformedEnv(env, Compose(*transforms))

@@ -8,7 +8,6 @@ from typing import Literal
 
 import torch
 from tensordict import NonTensorStack, TensorDictBase
-from torch import Tensor
 from torchrl.data import NonTensor, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
@@ -30,7 +29,7 @@ class Instruction(Transform):
         seed: of the transform's own generator.
 
     Raises:
-        ValueError: an unknown keyword, an empty sentence.
+        ValueError: an unknown keyword; at reset, a sentence without words or not one sentence per car.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -59,18 +58,20 @@ class Instruction(Transform):
         self._source = Sentences(split)
         self._random = random.Random(seed)
         self._said: list[str] = []
-        self._tokens: Tensor | None = None
+        self._tokens = torch.zeros(0, self.tokenizer.max_tokens, dtype=torch.long)
 
     def _draw(self) -> str:
         return self._source.sample(self._random.choice(self.keywords), self._random)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         cars = tensordict_reset.numel()
+        if self.fixed is not None and len(self.fixed) != cars:
+            raise ValueError(f"{len(self.fixed)} sentences for {cars} cars; give one to each")
         reset = tensordict.get("_reset", None)
-        if self._tokens is None or reset is None:
+        if reset is None or len(self._tokens) != cars:
             rows = torch.arange(cars)
             self._said = [""] * cars
-            self._tokens = torch.zeros(cars, self.tokenizer.max_tokens, dtype=torch.long, device=tensordict_reset.device)
+            self._tokens = self._tokens.new_zeros(cars, self.tokenizer.max_tokens, device=tensordict_reset.device)
         else:
             rows = reset.view(-1).nonzero().squeeze(-1).cpu()
         for row in rows.tolist():

@@ -95,6 +95,7 @@ class TownEnv(EnvBase):
         self._progress = torch.zeros(num_cars, device=self.device)
         self._steps = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         self._standing = torch.zeros(num_cars, dtype=torch.long, device=self.device)
+        self._goal = torch.full((num_cars,), math.inf, device=self.device)
         self._limit = torch.full((num_cars,), max_steps, device=self.device)
         self._on_street = (self.town.lane_manoeuvre == SubTask.LANEFOLLOW).nonzero().squeeze(-1)
         self._plan = torch.zeros(num_cars, 0, dtype=torch.long, device=self.device)
@@ -115,7 +116,7 @@ class TownEnv(EnvBase):
         self.observation_spec = Composite(shape=batch, device=device)
         self.observation_spec[keys.POSE] = real(3)
         self.observation_spec[keys.ROUTE] = Bounded(0, lanes - 1, (*batch, ROUTE_LANES), device, torch.int16)
-        for key in (keys.SPEED, keys.ROUTE_POSITION, keys.PROGRESS, keys.CROSS_TRACK_ERROR):
+        for key in (keys.SPEED, keys.ROUTE_POSITION, keys.PROGRESS, keys.REMAINING, keys.CROSS_TRACK_ERROR):
             self.observation_spec[key] = real(1)
         for key in (keys.OFF_ROAD, keys.WRONG_LANE, keys.COLLISION):
             self.observation_spec[key] = flag()
@@ -133,6 +134,7 @@ class TownEnv(EnvBase):
         self._plan_length = torch.tensor([len(route.lanes) for route in routes], device=self.device)
         self._plan_start = torch.tensor([route.start for route in routes], device=self.device)
         self._plan_pose = torch.tensor([e.start for e in episodes], dtype=torch.float64, device=self.device)
+        self._goal = torch.tensor([route.length for route in routes], device=self.device)
         seconds = [1.5 * route.length / CRUISE_SPEED + PATIENCE for route in routes]
         self._limit = torch.tensor([math.ceil(s / vehicle.TIME_STEP) for s in seconds], device=self.device)
 
@@ -178,8 +180,9 @@ class TownEnv(EnvBase):
         self._state = torch.where(mask.unsqueeze(-1), state, self._state)
         self._route = torch.where(mask.unsqueeze(-1), torch.stack(route, -1), self._route)
         self._position = torch.where(mask, position, self._position)
-        for counter in (self._progress, self._steps, self._standing):
-            counter.masked_fill_(mask, 0)
+        self._progress = self._progress.masked_fill(mask, 0)  # a new tensor: the one before is in the step's output
+        self._steps.masked_fill_(mask, 0)
+        self._standing.masked_fill_(mask, 0)
         return self._observe()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -193,10 +196,11 @@ class TownEnv(EnvBase):
             vehicle.acceleration(throttle.clamp(0, 1), speed),
         )
         self._state = torch.where(mask.unsqueeze(-1), state, self._state)
-        before = self._progress.clone()
+        before = self._progress
         self._advance(mask)
         self._steps += mask
-        self._standing = torch.where(mask & (self._state[:, 3] < STANDING_SPEED), self._standing + 1, 0 * self._standing)
+        stands = self._state[:, 3] < STANDING_SPEED
+        self._standing = torch.where(mask, (self._standing + 1) * stands, self._standing)
         out = self._observe()
         out["reward"] = (self._progress - before).unsqueeze(-1)
         terminated = out[keys.COLLISION] | (self._standing >= STANDING_STEPS).unsqueeze(-1)
@@ -232,6 +236,7 @@ class TownEnv(EnvBase):
         out[keys.ROUTE] = self._route.short()
         out[keys.ROUTE_POSITION] = self._position.unsqueeze(-1)
         out[keys.PROGRESS] = self._progress.unsqueeze(-1)
+        out[keys.REMAINING] = (self._goal - self._progress).unsqueeze(-1)
         out[keys.CROSS_TRACK_ERROR] = cross_track.unsqueeze(-1)
         out[keys.OFF_ROAD] = (beyond_edge > 0).any(-1, keepdim=True)
         out[keys.WRONG_LANE] = oncoming.sum(-1, keepdim=True) >= WRONG_LANE_CORNERS

@@ -5,11 +5,12 @@ from __future__ import annotations
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
 from ldrl.language.sentences import Sentences, Split
-from ldrl.language.tokens import PADDING, UNKNOWN, Tokenizer, normalise
+from ldrl.language.tokens import MAX_TOKENS, PADDING, UNKNOWN, Tokenizer, normalise
 
 __all__ = [
     "DIMENSIONS",
     "KEYWORDS",
+    "MAX_TOKENS",
     "PADDING",
     "UNKNOWN",
     "Glove",

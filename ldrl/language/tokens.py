@@ -11,8 +11,10 @@ import torch
 
 from ldrl.language.glove import SPECIAL_ROWS, Glove, load_glove
 
-__all__ = ["PADDING", "UNKNOWN", "Tokenizer", "normalise"]
+__all__ = ["MAX_TOKENS", "PADDING", "UNKNOWN", "Tokenizer", "normalise"]
 
+MAX_TOKENS = 48
+"""Words of an instruction that are kept unless said otherwise."""
 PADDING = 0
 """Token id after the end of a sentence."""
 UNKNOWN = 1
@@ -70,7 +72,7 @@ class Tokenizer:
         Counter({'lefft': 1})
     """
 
-    def __init__(self, max_tokens: int = 48, glove: Glove | None = None) -> None:
+    def __init__(self, max_tokens: int = MAX_TOKENS, glove: Glove | None = None) -> None:
         if max_tokens < 1:
             raise ValueError(f"max_tokens is {max_tokens}: a sentence needs at least 1")
         self.max_tokens = max_tokens

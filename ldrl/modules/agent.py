@@ -11,6 +11,7 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from ldrl import keys
+from ldrl.language import MAX_TOKENS
 from ldrl.modules.controller import VOTES, SwitchingController
 from ldrl.modules.high_level import HighLevelPolicy
 from ldrl.modules.low_level import LowLevelPolicy
@@ -31,7 +32,6 @@ class AgentConfig:
         instruction_hidden: size of the instruction's GRU.
         subtask_embedding: size of the previous sub-task's embedding.
         high_level_hidden: size of the high-level GRU.
-        max_tokens: longest instruction, in words.
     """
 
     image_channels: int = 1
@@ -41,7 +41,6 @@ class AgentConfig:
     instruction_hidden: int = 32
     subtask_embedding: int = 16
     high_level_hidden: int = 128
-    max_tokens: int = 48
 
     @classmethod
     def paper(cls) -> AgentConfig:
@@ -68,7 +67,7 @@ class HierarchicalAgent(TensorDictModuleBase):
     Examples:
         >>> from ldrl.envs import make_env
         >>> agent = HierarchicalAgent()
-        >>> env = make_env("town1", num_cars=2, agent=agent, seed=0)
+        >>> env = make_env("town1", num_cars=2, policy=agent)
         >>> env.rollout(3, agent)["action"].shape
         torch.Size([2, 3, 2])
     """
@@ -99,7 +98,7 @@ class HierarchicalAgent(TensorDictModuleBase):
             keys.AGENT_SUBTASK: Categorical(len(SubTask), ()),
             keys.VOTES: Bounded(0, 1, (VOTES,), dtype=torch.bool),
             keys.AGE: Unbounded((), dtype=torch.int64),
-            keys.PLANNED_TOKENS: Unbounded((self.config.max_tokens,), dtype=torch.int64),
+            keys.PLANNED_TOKENS: Unbounded((MAX_TOKENS,), dtype=torch.int64),
             keys.HIGH_LEVEL_STATE: Unbounded((self.high_level.hidden,)),
             self.control.state_key: Unbounded((self.control.hidden,)),
             self.end_of_subtask.state_key: Unbounded((self.end_of_subtask.hidden,)),

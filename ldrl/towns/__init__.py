@@ -1,7 +1,8 @@
 """Maps: street layouts, expanded into highway-env road networks, compiled into tensors; routes through them."""
 
 from ldrl.towns.layout import LAYOUTS, Layout, load_layout
-from ldrl.towns.routes import Route, UnrealisableError, match_route, plan_route, plan_routes
+from ldrl.towns.matching import match_route
+from ldrl.towns.routes import Route, UnrealisableError, plan_route, plan_routes
 from ldrl.towns.town import ROUTE_LANES, Town
 
 __all__ = [

@@ -14,7 +14,7 @@ __all__ = ["CELL", "MARGIN", "Surface", "rasterise", "sample"]
 CELL = 0.5
 """Edge of a raster cell, m."""
 MARGIN = 8.0
-"""How far the rasters reach beyond the outermost lane, and the largest distance they tell, m."""
+"""How far the rasters reach beyond the edge of the road, and the largest distance they tell, m."""
 
 
 class Surface(NamedTuple):
@@ -45,12 +45,13 @@ def rasterise(points: Tensor, headings: Tensor, half_width: float, spacing: floa
         The rasters. Each cell looks at the straight pieces through the samples within reach, so the distance is
         exact to the curvature within half a spacing.
     """
-    origin = points.amin(0) - MARGIN
-    width, height = ((points.amax(0) + MARGIN - origin) / CELL).ceil().int().add(1).tolist()
-    reach = math.ceil((half_width + MARGIN) / CELL)
+    border = half_width + MARGIN
+    origin = points.amin(0) - border
+    width, height = ((points.amax(0) + border - origin) / CELL).ceil().int().add(1).tolist()
+    reach = math.ceil(border / CELL)
     steps = torch.arange(-reach, reach + 1)
     window = torch.cartesian_prod(steps, steps).flip(-1)
-    distance = torch.full((height * width,), half_width + MARGIN)
+    distance = torch.full((height * width,), border)
     nearest = torch.zeros(height * width, dtype=torch.long)
     tangents = torch.stack((headings.cos(), headings.sin()), -1)
     for rows in torch.arange(len(points)).split(256):

@@ -75,7 +75,10 @@ class Town(nn.Module):
         self.name = name
         self.network = network
         self.lane_indices = [
-            (start, end, k) for start, ends in network.graph.items() for end, lanes in ends.items() for k in range(len(lanes))
+            (start, end, k)
+            for start, ends in network.graph.items()
+            for end, side_by_side in ends.items()
+            for k in range(len(side_by_side))
         ]
         lanes = [network.get_lane(index) for index in self.lane_indices]
         self._register_lanes(lanes)

@@ -1,0 +1,163 @@
+"""Evaluation: exactly one drive per episode, and what it was worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ldrl import keys
+from ldrl.envs import Episode, make_env
+from ldrl.subtasks import SubTask
+from ldrl.towns import Town
+
+__all__ = ["Outcome", "evaluate"]
+
+NEAR = 10.0
+"""A drive succeeds that passes every point of the path, and its last, this close (paper's evaluation), m."""
+FINISH_NEAR = 15.0
+"""Strictly, ``finish`` must be declared this close to the path's last point, m."""
+RECORDED = (keys.POSE, keys.SPEED, keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an episode went.
+
+    Args:
+        episode: what was to be done.
+        success: the paper's measure: no collision, and every point of the path within 10 m of the track.
+        strict_success: success, never off the road or in an oncoming lane, and ``finish`` declared within 15 m of the
+            path's end.
+        collision: whether the car hit a building.
+        off_road: whether a corner of the car left the road.
+        wrong_lane: whether the car was in an oncoming lane outside junctions.
+        finished: whether the agent declared ``finish``.
+        stuck: whether the car came to a stand though the agent had not finished.
+        finish_distance: from the path's end where ``finish`` was declared, m; None where it was not.
+        largest_gap: the largest distance from a point of the path to the track, m.
+        seconds: how long it drove.
+        track: ``[T, 2]`` float32, x and y, m.
+        subtasks: ``[T]`` int64, the agent's sub-task there; ``LANEFOLLOW`` for policies without sub-tasks.
+    """
+
+    episode: Episode
+    success: bool
+    strict_success: bool
+    collision: bool
+    off_road: bool
+    wrong_lane: bool
+    finished: bool
+    stuck: bool
+    finish_distance: float | None
+    largest_gap: float
+    seconds: float
+    track: Tensor
+    subtasks: Tensor
+
+    def record(self) -> dict[str, object]:
+        """The outcome as JSON values, without the track."""
+        episode = {name: getattr(self.episode, name) for name in ("id", "town", "keyword", "instruction")}
+        hidden = ("episode", "track", "subtasks")
+        return episode | {name: value for name, value in vars(self).items() if name not in hidden}
+
+
+def evaluate(
+    policy: TensorDictModuleBase | Callable[[Town], TensorDictModuleBase],
+    episodes: Sequence[Episode],
+    towns: dict[str, Town],
+    *,
+    num_cars: int = 64,
+    device: torch.device | str = "cpu",
+    progress: Callable[[int], object] | None = None,
+) -> list[Outcome]:
+    """Drive each episode once.
+
+    Args:
+        policy: the agent, or what makes a policy for a town, such as :class:`~ldrl.collectors.Expert`.
+        episodes: of any towns.
+        towns: by name, all that the episodes name.
+        num_cars: episodes driven side by side.
+        device: where to drive.
+        progress: called with the number of episodes done after each batch of them.
+
+    Returns:
+        One outcome per episode, in the same order.
+
+    Raises:
+        ValueError: an episode of an unknown town, or one whose start or path is off the road.
+    """
+    unknown = {episode.town for episode in episodes} - set(towns)
+    if unknown:
+        raise ValueError(f"unknown town {min(unknown)!r}; use one of {', '.join(towns)}")
+    outcomes: dict[int, Outcome] = {}
+    for name, town in towns.items():
+        rows = [i for i, episode in enumerate(episodes) if episode.town == name]
+        # Episodes of like length together: a batch drives until its last car is done.
+        rows.sort(key=lambda i: len(episodes[i].path))
+        actor = policy if isinstance(policy, TensorDictModuleBase) else policy(town)
+        for start in range(0, len(rows), num_cars):
+            batch = rows[start : start + num_cars]
+            env = make_env(town, episodes=[episodes[i] for i in batch], policy=actor, device=device)
+            for i, outcome in zip(batch, _drive(env, actor, [episodes[i] for i in batch]), strict=True):
+                outcomes[i] = outcome
+            if progress is not None:
+                progress(len(batch))
+    return [outcomes[i] for i in range(len(episodes))]
+
+
+@torch.no_grad()
+def _drive(env: EnvBase, policy: TensorDictModuleBase, episodes: Sequence[Episode]) -> list[Outcome]:
+    """Drive one batch, each row until its own end."""
+    tensordict = env.reset()
+    frames = [tensordict.select(*RECORDED)]
+    running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    mask = [running]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        while running.any():
+            tensordict = env.step(policy(tensordict.set("_step", running)))
+            # What was chosen belongs to the frame that it was chosen at.
+            frames[-1].update(tensordict.select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
+            frames.append(tensordict["next"].select(*RECORDED))
+            mask.append(running)
+            running = running & ~tensordict["next", "done"].squeeze(-1)
+            tensordict = step_mdp(tensordict)
+    frames[-1].update(frames[-2].select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
+    drives = torch.stack(frames, 1).cpu()
+    lengths = torch.stack(mask, 1).sum(1).tolist()
+    return [_judge(episode, drives[k, :n]) for k, (episode, n) in enumerate(zip(episodes, lengths, strict=True))]
+
+
+def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:
+    """What a drive was worth."""
+    track = drive[keys.POSE][:, :2]
+    path = torch.tensor(episode.path)
+    gap = torch.cdist(path, track).amin(1)
+    finish = drive.get(keys.AGENT_FINISH, torch.zeros(len(track), dtype=torch.bool)).nonzero()
+    finish_distance = float((track[finish[0, 0]] - path[-1]).norm()) if len(finish) else None
+    collision, off_road, wrong_lane = (
+        bool(drive[key].any()) for key in (keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
+    )
+    success = not collision and float(gap.max()) <= NEAR
+    declared = finish_distance is not None and finish_distance <= FINISH_NEAR
+    return Outcome(
+        episode=episode,
+        success=success,
+        strict_success=success and not off_road and not wrong_lane and declared,
+        collision=collision,
+        off_road=off_road,
+        wrong_lane=wrong_lane,
+        finished=finish_distance is not None,
+        stuck=finish_distance is None and float(drive[keys.SPEED][-1]) < 0.1,
+        finish_distance=None if finish_distance is None else round(finish_distance, 2),
+        largest_gap=round(float(gap.max()), 2),
+        seconds=round((len(track) - 1) / 10, 1),
+        track=track,
+        subtasks=drive.get(keys.AGENT_SUBTASK, torch.full((len(track),), int(SubTask.LANEFOLLOW))),
+    )

@@ -1,0 +1,202 @@
+"""Segments: stretches of a drive that realise a keyword, and the decisions in them to train the high-level policy."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers import Sampler, Storage
+
+from ldrl import keys
+from ldrl.collectors.demonstrations import TRAJECTORY
+from ldrl.collectors.snippets import Snippets, cut_snippets
+from ldrl.language import KEYWORDS, Keyword, Sentences, Tokenizer, realised_by
+from ldrl.modules.high_level import NO_SUBTASK
+from ldrl.subtasks import SubTask
+from ldrl.towns import Town
+
+__all__ = ["BoundarySampler", "Segment", "find_segments"]
+
+START = (-70, 11)
+"""Frames around the begin of the first manoeuvre in which most instructions are given: from 39 m before it to its
+junction's entry."""
+ANYWHERE = 0.25
+"""Share of instructions given anywhere on the way to the first manoeuvre."""
+BOUNDARY = (-4, 8)
+"""Frames around a boundary in which a decision may fall: a sub-task is voted to have ended a little early or late."""
+NONSENSE = 0.03
+"""Share of instructions that nobody understands, known and unknown words at random: the safe answer is to stop."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of a drive that realises a keyword.
+
+    Args:
+        snippets: indices of its snippets: the way to the first manoeuvre first, the one behind the last one last.
+    """
+
+    snippets: tuple[int, ...]
+
+
+def find_segments(
+    town: Town, snippets: Snippets, lane: Tensor, max_junctions: int = 3
+) -> dict[str, list[Segment]]:
+    """Find every segment of drives that realises a keyword.
+
+    Args:
+        town: where the drives are.
+        snippets: of the drives.
+        lane: the current lane of each frame, ``[N]`` integer.
+        max_junctions: the longest segments cross so many junctions: 1 or 2 in the paper, where ordinals of 3 are rare.
+
+    Returns:
+        Segments by keyword.
+    """
+    found: dict[str, list[Segment]] = {name: [] for name in KEYWORDS}
+    subtasks, drives = snippets.subtask.tolist(), snippets.drive_start.tolist()
+    options = _options(town)
+    offered: list[frozenset[SubTask] | None] = []
+    for subtask, start, end in zip(subtasks, snippets.start.tolist(), snippets.end.tolist(), strict=True):
+        in_junction = [k for k in lane[start:end].unique().tolist() if int(town.lane_manoeuvre[k]) == subtask]
+        offered.append(options[in_junction[0]] if subtask != SubTask.LANEFOLLOW and in_junction else None)
+    for first in range(len(subtasks)):
+        if subtasks[first] != SubTask.LANEFOLLOW:
+            continue
+        manoeuvres: list[int] = []
+        for last in range(first + 1, len(subtasks)):
+            if drives[last] != drives[first] or len(manoeuvres) > max_junctions:
+                break
+            if subtasks[last] != SubTask.LANEFOLLOW:
+                manoeuvres.append(last)
+                if offered[last] is None:
+                    break
+            elif manoeuvres and len(manoeuvres) <= max_junctions:
+                for keyword in realised_by(
+                    [SubTask(subtasks[k]) for k in manoeuvres], [offered[k] or frozenset() for k in manoeuvres]
+                ):
+                    found[keyword.name].append(Segment(tuple(range(first, last + 1))))
+    return found
+
+
+def _options(town: Town) -> list[frozenset[SubTask]]:
+    """What the junction before or at each lane offers to a car that comes the same way."""
+    before = town.lane_predecessor.tolist()
+    return [frozenset(SubTask(int(town.lane_manoeuvre[k])) for k in town.successors(p)) for p in before]
+
+
+class BoundarySampler(Sampler):
+    """Draws sequences of high-level decisions at the boundaries between sub-tasks, as many of each keyword.
+
+    The first decision is where the instruction is given; each later one falls around the end of the sub-task before;
+    the last one is ``FINISH``. The batch size of the buffer counts decisions, padding included. Each gets the
+    instruction's tokens, ``("agent", "previous_subtask")``, the right ``subtask`` and ``mask``, False for padding.
+
+    Args:
+        buffer: demonstrations.
+        town: where they were driven.
+        tokenizer: writes the instructions.
+        max_junctions: see :func:`find_segments`.
+        seed: of the sampler's own generator.
+
+    Raises:
+        ValueError: no segment realises a keyword.
+    """
+
+    def __init__(
+        self,
+        buffer: TensorDictReplayBuffer,
+        town: Town,
+        tokenizer: Tokenizer | None = None,
+        *,
+        max_junctions: int = 3,
+        seed: int = 0,
+    ) -> None:
+        stored = buffer.storage[:]
+        self._subtask = torch.as_tensor(stored[keys.SUBTASK])
+        self._snippets = cut_snippets(self._subtask, torch.as_tensor(stored[TRAJECTORY]))
+        self._segments = find_segments(town, self._snippets, stored[keys.ROUTE][:, 1].long(), max_junctions)
+        lacking = [name for name, segments in self._segments.items() if not segments]
+        if lacking:
+            raise ValueError(f"no drive in {len(stored)} frames realises {', '.join(lacking)}; collect more")
+        self.decisions = 2 * max_junctions + 1
+        self._tokenizer = Tokenizer() if tokenizer is None else tokenizer
+        self._sentences = Sentences("train")
+        self._words = [word for word in self._tokenizer.glove.words if word.isalpha()]
+        self._random = random.Random(seed)
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[Any, Tensor]]:
+        """Draw sequences.
+
+        Args:
+            storage: unused, the segments are known.
+            batch_size: decisions, a multiple of ``decisions``.
+
+        Returns:
+            Indices ``[batch_size]``, sequence by sequence, and what is written into the sample.
+        """
+        if batch_size % self.decisions:
+            raise ValueError(f"a batch of {batch_size} does not divide into sequences of {self.decisions} decisions")
+        frames, targets, previous, sentences = [], [], [], []
+        for _ in range(batch_size // self.decisions):
+            keyword = self._random.choice(list(KEYWORDS.values()))
+            sequence = self._decisions(self._random.choice(self._segments[keyword.name]))
+            sentence = self._sentences.sample(keyword, self._random)
+            if self._random.random() < NONSENSE:
+                sequence = [(sequence[0][0], SubTask.FINISH)]
+                unknown = self._random.random()
+                words = self._random.choices(self._words, k=self._random.randint(1, 12))
+                sentence = " ".join("zzyzzyx" if self._random.random() < unknown else word for word in words)
+            padding = self.decisions - len(sequence)
+            frames.append([frame for frame, _ in sequence] + [sequence[-1][0]] * padding)
+            chosen = [int(target) for _, target in sequence]
+            targets.append(chosen + [int(SubTask.FINISH)] * padding)
+            previous.append([NO_SUBTASK, *chosen[:-1]] + [NO_SUBTASK] * padding)
+            sentences.append((sentence, len(sequence)))
+        tokens = self._tokenizer([sentence for sentence, _ in sentences])
+        length = torch.tensor([n for _, n in sentences])
+        info = {
+            keys.SUBTASK: torch.tensor(targets).flatten(),
+            keys.PREVIOUS_SUBTASK: torch.tensor(previous).flatten(),
+            keys.INSTRUCTION_TOKENS: tokens.repeat_interleave(self.decisions, 0),
+            "mask": (torch.arange(self.decisions) < length.unsqueeze(-1)).flatten(),
+        }
+        return torch.tensor(frames).flatten(), info
+
+    def _decisions(self, segment: Segment) -> list[tuple[int, SubTask]]:
+        """Frames and right answers of one drive through a segment."""
+        first, manoeuvre = segment.snippets[:2]
+        begin, boundary = int(self._snippets.start[first]), int(self._snippets.start[manoeuvre])
+        earliest = begin if self._random.random() < ANYWHERE else max(begin, boundary + START[0])
+        frame = self._random.randint(earliest, boundary + START[1])
+        snippets = list(segment.snippets) if frame < boundary else list(segment.snippets[1:])
+        decisions = [(frame, SubTask(int(self._snippets.subtask[snippets[0]])))]
+        for k in snippets[1:]:
+            frame = int(self._snippets.start[k]) + self._random.randint(*BOUNDARY)
+            frame = min(frame, int(self._snippets.drive_end[k]) - 1)
+            decisions.append((frame, SubTask(int(self._snippets.subtask[k]))))
+        decisions[-1] = (decisions[-1][0], SubTask.FINISH)
+        return decisions
+
+    def _empty(self) -> None:
+        raise RuntimeError("a BoundarySampler is bound to the demonstrations that it was made from; make a new one")
+
+    def state_dict(self) -> dict[str, Any]:
+        """The generator's state."""
+        return {"random": self._random.getstate()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the generator's state."""
+        self._random.setstate(state_dict["random"])
+
+    def dumps(self, path: Any) -> None:
+        """Save the state to a file."""
+        torch.save(self.state_dict(), path)
+
+    def loads(self, path: Any) -> None:
+        """Load the state from a file."""
+        self.load_state_dict(torch.load(path, weights_only=False))

@@ -1,0 +1,69 @@
+"""The car against hand-computed cases and against where it should end up."""
+
+import math
+
+import pytest
+import torch
+
+from ldrl.envs import vehicle
+
+
+def test_straight_ahead_by_hand():
+    after = vehicle.bicycle_step(torch.tensor([1.0, 2.0, 0.0, 5.0]), torch.tensor(0.0), torch.tensor(1.5))
+    assert after.tolist() == pytest.approx([1.5, 2.0, 0.0, 5.15])
+
+
+def test_a_right_turn_by_hand():
+    """Heading south at 4 m/s, wheels turned so far right that the slip angle is 30 degrees."""
+    steering_angle = torch.tensor(math.atan(2 * math.tan(math.pi / 6)))
+    state = torch.tensor([0.0, 0.0, math.pi / 2, 4.0])
+    after = vehicle.bicycle_step(state, steering_angle, torch.tensor(0.0))
+    # it moves 0.4 m along 120 degrees, clockwise from east, and turns 4 m/s * 0.5 / 2.5 m * 0.1 s to the right
+    assert after.tolist() == pytest.approx([-0.2, 0.4 * math.sqrt(3) / 2, math.pi / 2 + 0.08, 4.0], abs=1e-6)
+
+
+def test_throttle_map():
+    throttle = torch.tensor([0.0, 0.0, 0.0, 0.3, 1.0, 1.0])
+    speed = torch.tensor([5.0, 0.1, 0.0, 5.0, 5.0, 0.0])
+    assert vehicle.acceleration(throttle, speed).tolist() == pytest.approx([-1.5, -0.5, 0, 0, 3.5, 5])
+
+
+def test_rolls_to_a_stop_within_12_metres():
+    state = torch.tensor([0.0, 0.0, 0.0, 20 / 3.6], dtype=torch.float64)
+    speeds = []
+    for _ in range(100):
+        zero = state.new_zeros(())
+        state = vehicle.bicycle_step(state, zero, vehicle.acceleration(zero, state[3]))
+        speeds.append(float(state[3]))
+    assert 8 < state[0] < 12
+    assert min(speeds) >= 0  # never backwards
+    assert speeds[-1] < 1e-6
+
+
+def test_speed_is_capped_as_in_highway_env():
+    after = vehicle.bicycle_step(torch.tensor([0.0, 0.0, 0.0, 43.0]), torch.tensor(0.0), torch.tensor(5.0))
+    assert float(after[3]) == pytest.approx(42.7)
+
+
+@pytest.mark.parametrize(("forward", "right"), [(8.0, 0.0), (6.0, 1.0), (3.5, -0.8), (10.0, -6.0), (2.0, 2.0)])
+def test_steer_towards_meets_the_point(forward, right, monkeypatch):
+    monkeypatch.setattr(vehicle, "TIME_STEP", 1e-4)
+    point = torch.tensor([forward, right], dtype=torch.float64)
+    steer = vehicle.steer_towards(point[0], point[1])
+    assert abs(steer) < 1
+    state, closest = torch.tensor([0.0, 0.0, 0.0, 50.0], dtype=torch.float64), math.inf
+    for _ in range(4000):
+        state = vehicle.bicycle_step(state, steer * vehicle.MAX_STEERING_ANGLE, point.new_zeros(()))
+        closest = min(closest, float((state[:2] - point).norm()))
+    assert closest < 0.01
+
+
+def test_steer_towards_is_bounded_and_finite():
+    forward, right = torch.tensor([0.5, 0.5, 0.0, 3.0]), torch.tensor([2.0, -2.0, 1.0, 0.0])
+    assert vehicle.steer_towards(forward, right).tolist() == pytest.approx([1.0, -1.0, 1.0, 0.0])
+
+
+def test_footprint():
+    corners = vehicle.footprint(torch.tensor([[10.0, 20.0, 0.0], [10.0, 20.0, math.pi / 2]]))
+    assert corners[0].flatten().tolist() == pytest.approx([12.5, 21, 7.5, 21, 7.5, 19, 12.5, 19])
+    assert corners[1].flatten().tolist() == pytest.approx([9, 22.5, 9, 17.5, 11, 17.5, 11, 22.5], abs=1e-5)
