@@ -1,0 +1,23 @@
+"""The expert, demonstrations and what is sampled from them, evaluation and reports."""
+
+from ldrl.collectors.demonstrations import SteeringNoise, collect_demonstrations
+from ldrl.collectors.evaluation import Outcome, evaluate
+from ldrl.collectors.expert import Expert, expert_action
+from ldrl.collectors.segments import BoundarySampler, Segment, find_segments
+from ldrl.collectors.snippets import DisturbedView, Snippets, SnippetSampler, cut_snippets
+
+__all__ = [
+    "BoundarySampler",
+    "DisturbedView",
+    "Expert",
+    "Outcome",
+    "Segment",
+    "SnippetSampler",
+    "Snippets",
+    "SteeringNoise",
+    "collect_demonstrations",
+    "cut_snippets",
+    "evaluate",
+    "expert_action",
+    "find_segments",
+]

@@ -36,7 +36,7 @@ class Instruction(Transform):
         >>> from ldrl.envs import TownEnv
         >>> from ldrl.towns import Town
         >>> env = TransformedEnv(TownEnv(Town.load("town1"), num_cars=1), Instruction(["turn left"], text=True))
-        >>> env.reset()["language_instruction"]
+        >>> list(env.reset()["language_instruction"])
         ['turn left']
     """
 

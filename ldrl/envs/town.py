@@ -98,7 +98,8 @@ class TownEnv(EnvBase):
         self._goal = torch.full((num_cars,), math.inf, device=self.device)
         self._limit = torch.full((num_cars,), max_steps, device=self.device)
         self._on_street = (self.town.lane_manoeuvre == SubTask.LANEFOLLOW).nonzero().squeeze(-1)
-        self._plan = torch.zeros(num_cars, 0, dtype=torch.long, device=self.device)
+        self._plan = torch.zeros(num_cars, 1, dtype=torch.long, device=self.device)
+        self._plan_length = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         self._planned = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         if episodes is not None:
             self._load(episodes)
@@ -145,20 +146,18 @@ class TownEnv(EnvBase):
     def _uniform(self) -> Tensor:
         return torch.rand(self.batch_size, generator=self._generator, device=self.device)
 
-    def _following(self, lane: Tensor) -> Tensor:
-        """The next lane of each car's route: as planned, else at random."""
+    def _following(self, lane: Tensor, k: Tensor | int) -> Tensor:
+        """The lane after ``lane`` of each car's route: the plan's lane ``k``, behind its end a random one."""
         count = self.town.lane_successor_count[lane]
         chosen = (self._uniform() * count).long().minimum(count - 1)
         following = self.town.lane_successors[lane].gather(-1, chosen.unsqueeze(-1)).squeeze(-1)
-        if self._plan.shape[-1]:
-            planned = self._plan.gather(-1, self._planned.clamp(max=self._plan.shape[-1] - 1).unsqueeze(-1))
-            following = torch.where(self._planned < self._plan_length, planned.squeeze(-1), following)
-            self._planned = self._planned + 1
-        return following
+        k = torch.as_tensor(k, device=self.device).expand(self.batch_size)
+        planned = self._plan.gather(-1, k.clamp(max=self._plan.shape[-1] - 1).unsqueeze(-1)).squeeze(-1)
+        return torch.where(k < self._plan_length, planned, following)
 
     def _start(self) -> tuple[Tensor, Tensor, Tensor]:
         """First lane, route position and pose of every car."""
-        if self._plan.shape[-1]:
+        if self.episodes is not None:
             return self._plan[:, 0], self._plan_start, self._plan_pose
         weights = self.town.lane_length[self._on_street]
         lane = self._on_street[weights.multinomial(self.numel(), True, generator=self._generator)]
@@ -169,16 +168,14 @@ class TownEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         reset = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self._steps, dtype=torch.bool) if reset is None else reset.view(self.batch_size)
-        planned = self._planned
         lane, position, pose = self._start()
-        self._planned = torch.ones_like(planned)
         route = [self.town.lane_predecessor[lane], lane]
         while len(route) < ROUTE_LANES:
-            route.append(self._following(route[-1]))
-        self._planned = torch.where(mask, self._planned, planned)
+            route.append(self._following(route[-1], len(route) - 1))
         state = torch.cat((pose, pose.new_full((*self.batch_size, 1), vehicle.INITIAL_SPEED)), -1)
         self._state = torch.where(mask.unsqueeze(-1), state, self._state)
         self._route = torch.where(mask.unsqueeze(-1), torch.stack(route, -1), self._route)
+        self._planned = self._planned.masked_fill(mask, ROUTE_LANES - 1)
         self._position = torch.where(mask, position, self._position)
         self._progress = self._progress.masked_fill(mask, 0)  # a new tensor: the one before is in the step's output
         self._steps.masked_fill_(mask, 0)
@@ -217,9 +214,9 @@ class TownEnv(EnvBase):
         length = self.town.lane_length[self._route[:, 1]]
         passed = position >= length
         self._position = torch.where(passed, position - length, position)
-        planned = self._planned
-        shifted = torch.cat((self._route[:, 1:], self._following(self._route[:, -1]).unsqueeze(-1)), -1)
-        self._planned = torch.where(passed, self._planned, planned)
+        following = self._following(self._route[:, -1], self._planned)
+        shifted = torch.cat((self._route[:, 1:], following.unsqueeze(-1)), -1)
+        self._planned = self._planned + passed
         self._route = torch.where(passed.unsqueeze(-1), shifted, self._route)
 
     def _observe(self) -> TensorDictBase:

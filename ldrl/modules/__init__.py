@@ -2,6 +2,7 @@
 
 from ldrl.modules.agent import AgentConfig, HierarchicalAgent
 from ldrl.modules.attention import GatedAttention, LuongAttention
+from ldrl.modules.checkpoint import PRETRAINED, load_agent, resolve_checkpoint, save_agent
 from ldrl.modules.controller import SwitchingController
 from ldrl.modules.encoders import ImageEncoder, InstructionEncoder
 from ldrl.modules.high_level import NO_SUBTASK, HighLevelPolicy, HistoryDecoder
@@ -9,6 +10,7 @@ from ldrl.modules.low_level import BranchedGRU, LowLevelPolicy
 
 __all__ = [
     "NO_SUBTASK",
+    "PRETRAINED",
     "AgentConfig",
     "BranchedGRU",
     "GatedAttention",
@@ -20,4 +22,7 @@ __all__ = [
     "LowLevelPolicy",
     "LuongAttention",
     "SwitchingController",
+    "load_agent",
+    "resolve_checkpoint",
+    "save_agent",
 ]

@@ -91,6 +91,18 @@ class HierarchicalAgent(TensorDictModuleBase):
             keys.ACTION, keys.AGENT_SUBTASK, keys.AGENT_FINISH, keys.SWITCH, *(("next", *key) for key in self._memory)
         ]  # fmt: skip
 
+    @classmethod
+    def from_pretrained(cls, name: str, device: torch.device | str = "cpu") -> HierarchicalAgent:
+        """A trained agent; see :func:`~ldrl.modules.load_agent`.
+
+        Args:
+            name: a checkpoint that ships with the package, such as ``"hierarchical-gs"``, or a folder.
+            device: where the agent is to run.
+        """
+        from ldrl.modules.checkpoint import load_agent
+
+        return load_agent(name, device)
+
     @property
     def _memory(self) -> dict[tuple[str, ...], TensorSpec]:
         """Key and spec of everything that the agent remembers, for one car."""

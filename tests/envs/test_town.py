@@ -3,6 +3,7 @@
 import math
 import random
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -55,7 +56,7 @@ def test_poses_equal_highway_envs_vehicle(town1):
     generator = torch.Generator().manual_seed(0)
     cars = []
     for (x, y, heading), speed in zip(env._state[:, :3].tolist(), env._state[:, 3].tolist(), strict=True):
-        cars.append(Vehicle(Road(), [x, y], heading, speed))
+        cars.append(Vehicle(Road(town1.network), [x, y], heading, speed))
     for step in range(500):
         action = torch.rand(4, 2, generator=generator) * torch.tensor([1.0, 2.0]) - torch.tensor([0.0, 1.0])
         action[:, 0] *= (step // 50) % 2  # rolls to a stop in between
@@ -90,7 +91,7 @@ def test_starts_in_lane_at_4_7_metres_per_second(town):
     assert not any(td[flag].any() for flag in FLAGS)
     route = td[keys.ROUTE].long()
     assert (town.lane_manoeuvre[route[:, 1]] == SubTask.LANEFOLLOW).all()
-    assert all(b in town.successors(a) for row in route.tolist() for a, b in zip(row, row[1:], strict=False))
+    assert all(b in town.successors(a) for row in route.tolist() for a, b in pairwise(row))
     assert len(route[:, 1].unique()) > 0.9 * (town.lane_manoeuvre == SubTask.LANEFOLLOW).sum()
 
 
@@ -110,7 +111,7 @@ def test_route_progress_and_cross_track_error_along_a_street(tee):
 
 
 def test_flags_of_hand_placed_cars_on_a_street(tee):
-    """Southbound through the middle: lane centre x = 58, oncoming lane x = 62, road from x = 53.7 to 64.3... ."""
+    """Southbound through the middle: lane centre x = 58, oncoming lane x = 62, road from x = 55.7 to 64.3."""
     south = math.pi / 2
     cases = {  # lateral position of the origin: off_road, wrong_lane, collision; the car is 2 m wide
         58.0: (False, False, False),
@@ -120,7 +121,7 @@ def test_flags_of_hand_placed_cars_on_a_street(tee):
         58.9: (False, False, False),
         62.0: (False, True, False),
         63.4: (True, True, False),
-        65.2: (True, False, False),  # two corners off the road on the left, two beyond the lane's edge
+        65.6: (True, False, False),  # all of it beyond the lanes
         52.8: (True, False, False),  # its right side at 51.8: on the sidewalk
         52.6: (True, False, True),  # at 51.6: the buildings stand at 51.7
     }
@@ -168,13 +169,10 @@ def test_a_collision_terminates(tee):
     env = TownEnv(tee, 2, seed=0)
     td = env.reset()
     env._state[0] = torch.tensor([57.0, 60.0, math.pi, 5.0], dtype=torch.float64)  # westward, to the buildings
-    for step in range(40):
-        td[keys.ACTION] = torch.tensor([0.3, 0.0]).expand(2, 2)
-        td = env.step(td)["next"]
-        if td[keys.COLLISION][0]:
-            break
+    seen = drive(env, [0.3, 0.0], 12, td)
+    td = next(td for td in seen if td[keys.COLLISION][0])
     assert 51.7 - 0.5 < float(td[keys.POSE][0, 0]) - 2.5 < 51.7
-    assert 4 <= step <= 8
+    assert torch.equal(td[keys.COLLISION], td["terminated"])
     assert td["terminated"].flatten().tolist() == td["done"].flatten().tolist() == [True, False]
     assert not td["truncated"].any()
 
@@ -229,27 +227,27 @@ def test_same_seed_same_rollout(town2):
 
 def test_global_generators_are_left_alone(town2, episodes):
     torch.manual_seed(1)
-    np.random.seed(1)  # noqa: NPY002
+    np.random.seed(1)
     random.seed(1)
-    before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()  # noqa: NPY002
+    before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()
     for env in (TownEnv(town2, 4, max_steps=5, seed=0), TownEnv(town2, episodes=episodes["town2"][:4], seed=1)):
         env.set_seed(3)
         env.rollout(12, Expert(town2), break_when_any_done=False)
     assert torch.equal(torch.get_rng_state(), before[0])
-    assert (np.random.get_state()[1] == before[1]).all()  # noqa: NPY002
+    assert (np.random.get_state()[1] == before[1]).all()
     assert random.getstate() == before[2]
 
 
 @pytest.mark.parametrize("with_episodes", [False, True])
 def test_a_partial_reset_leaves_other_cars_alone(town2, episodes, with_episodes):
     def env():
-        some = episodes["town2"][60:66] if with_episodes else None
+        some = sorted(episodes["town2"], key=lambda e: -len(e.path))[:6] if with_episodes else None
         return TownEnv(town2, None if with_episodes else 6, episodes=some, seed=0)
 
     reset, alone = env(), env()
     td, other = reset.reset(), alone.reset()
     expert = Expert(town2)
-    for _ in range(20):
+    for _ in range(120):  # far enough for routes to have moved on
         td, other = reset.step(expert(td))["next"], alone.step(expert(other))["next"]
     mask = torch.tensor([True, False, False, True, False, False])
     td = reset.reset(td.set("_reset", mask.unsqueeze(-1)))
@@ -257,16 +255,14 @@ def test_a_partial_reset_leaves_other_cars_alone(town2, episodes, with_episodes)
     assert td[keys.PROGRESS][mask].abs().max() == 0
     assert td[keys.SPEED][mask].flatten().tolist() == pytest.approx([4.7, 4.7])
     if with_episodes:
-        assert (td[mask] == start[mask]).all()
-    steps = 150
-    for _ in range(steps):
+        assert (td.select(*start.keys())[mask] == start[mask]).all()
+    for _ in range(150):
         td, other = reset.step(expert(td))["next"], alone.step(expert(other))["next"]
         routes_agree = (td[keys.ROUTE] == other[keys.ROUTE]).all(-1) & ~mask
         # roaming cars' later turns are drawn anew, all that they drive before is the same
         for key in (keys.POSE, keys.SPEED, keys.PROGRESS, "reward", "done"):
             assert torch.equal(td[key][routes_agree], other[key][routes_agree])
-        if with_episodes and _ < 100:
-            assert torch.equal(routes_agree, ~mask)
+        assert torch.equal(routes_agree, ~mask) or not with_episodes
 
 
 def test_outputs_do_not_change_afterwards(town2):
@@ -322,7 +318,9 @@ def test_a_car_that_ends_does_not_disturb_the_others(town2, episodes):
         td[keys.ACTION][0, 1:] = 1.0  # the first car of the four leaves the road
         return td
 
-    together = TownEnv(town2, episodes=some, seed=0).rollout(300, stubborn, break_when_all_done=True, break_when_any_done=False)
+    together = TownEnv(town2, episodes=some, seed=0).rollout(
+        300, stubborn, break_when_all_done=True, break_when_any_done=False
+    )
     assert together["next", "done"][0].any()
     ended = int(together["next", "done"][0].int().argmax())
     assert ended < 150

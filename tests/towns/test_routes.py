@@ -109,12 +109,16 @@ def test_ordinals_count_turns_that_exist(town):
 
 def test_planned_from_one_approach_only(town1):
     approach = next(a for a in town1.approaches() if not any(town1.lane_manoeuvre[j] == L for j in town1.successors(a)))
-    with pytest.raises(UnrealisableError, match="'left' meets a junction of 'town1' that offers only (right|straight), "):
+    with pytest.raises(
+        UnrealisableError, match=r"'left' meets a junction of 'town1' that offers only (right|straight), "
+    ):
         plan_route(town1, KEYWORDS["left"], approach)
 
 
 def test_a_keyword_that_a_town_cannot_realise(ring, no_left):
-    with pytest.raises(UnrealisableError, match="'ring' cannot realise 'left' from any of its 0 approaches.*no junction"):
+    with pytest.raises(
+        UnrealisableError, match=r"'ring' cannot realise 'left' from any of its 0 approaches.*no junction"
+    ):
         plan_routes(ring, KEYWORDS["left"])
     message = "'no left' cannot realise 'right,left' from any of its 6 .* meets a junction .* that offers only"
     with pytest.raises(UnrealisableError, match=message):
@@ -197,7 +201,7 @@ def test_bad_starts_are_named(town):
     with pytest.raises(ValueError, match=rf"start \[9999\.0, .* m from the nearest lane of '{town.name}'; move it"):
         match_route(town, (9999.0, y, heading), path)
     beside = (x + 40 * math.sin(heading), y - 40 * math.cos(heading), heading)
-    with pytest.raises(ValueError, match="start .* m from the nearest lane"):
+    with pytest.raises(ValueError, match=r"start .* m from the nearest lane"):
         match_route(town, beside, path)
     for turn in (math.pi, 1.7):
         with pytest.raises(ValueError, match=r"start .* faces against its lane .*; turn its heading \(rad\) around"):

@@ -55,7 +55,9 @@ def test_every_lanes_successors_connect(town):
 
 
 def test_approaches_lead_into_junctions(town):
-    into = [i for i in range(len(town.lane_length)) if any(town.lane_manoeuvre[j] in MANOEUVRES for j in town.successors(i))]
+    into = [
+        i for i in range(len(town.lane_length)) if any(town.lane_manoeuvre[j] in MANOEUVRES for j in town.successors(i))
+    ]
     assert town.approaches() == into
     assert len(into) == {"town1": 36, "town2": 24}[town.name]
 
@@ -139,7 +141,10 @@ def test_lane_directions(town):
     right = torch.stack((-ahead[:, 1], ahead[:, 0]), -1)
     follows = town.lane_manoeuvre[lane] == SubTask.LANEFOLLOW
     # a metre from either end of a lane the nearest cell may belong to the next one
-    first, last = town.lane_first[lane], town.lane_first[lane] + (town.lane_length / town.lane_spacing).round().long()[lane]
+    first, last = (
+        town.lane_first[lane],
+        town.lane_first[lane] + (town.lane_length / town.lane_spacing).round().long()[lane],
+    )
     inner = ((torch.arange(len(lane)) - first) >= 2) & ((last - torch.arange(len(lane))) >= 2)
 
     def along(offset):
@@ -163,7 +168,7 @@ def test_a_lane_that_leads_nowhere_is_named():
 
 
 def test_unknown_town_is_named():
-    with pytest.raises(ValueError, match="'town3'.*town1, town2"):
+    with pytest.raises(ValueError, match=r"'town3'.*town1, town2"):
         Town.load("town3")
 
 

@@ -1,0 +1,95 @@
+"""Checkpoints: a folder with the weights (safetensors) and the config (JSON)."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from ldrl.modules.agent import AgentConfig, HierarchicalAgent
+
+__all__ = ["PRETRAINED", "load_agent", "resolve_checkpoint", "save_agent"]
+
+WEIGHTS = "agent.safetensors"
+CONFIG = "agent.json"
+SHIPPED = Path(__file__).parent / "weights"
+PRETRAINED = tuple(sorted(folder.name for folder in SHIPPED.glob("*") if (folder / WEIGHTS).is_file()))
+"""Names of the checkpoints that ship with the package."""
+
+
+def save_agent(agent: HierarchicalAgent, folder: str | Path) -> None:
+    """Write a checkpoint; an old one is replaced only once the new one is complete.
+
+    Args:
+        agent: what to save.
+        folder: where; made if missing.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = {name: value.detach().cpu().contiguous() for name, value in agent.state_dict().items()}
+    save_file(weights, folder / f"{WEIGHTS}.part")
+    (folder / f"{CONFIG}.part").write_text(json.dumps(asdict(agent.config), indent=2) + "\n", encoding="utf-8")
+    for name in (WEIGHTS, CONFIG):
+        os.replace(folder / f"{name}.part", folder / name)
+
+
+def resolve_checkpoint(name: str | Path) -> Path:
+    """The folder of a checkpoint.
+
+    Args:
+        name: a folder, or the name of a checkpoint that ships with the package.
+
+    Raises:
+        ValueError: there is neither; the message lists the names.
+    """
+    for folder in (Path(name), SHIPPED / name):
+        if (folder / WEIGHTS).is_file() and (folder / CONFIG).is_file():
+            return folder
+    known = ", ".join(PRETRAINED) or "none"
+    raise ValueError(
+        f"no checkpoint {str(name)!r}; give a folder with {WEIGHTS} and {CONFIG}, or one of the shipped ones: {known}"
+    )
+
+
+def load_agent(name: str | Path, device: torch.device | str = "cpu") -> HierarchicalAgent:
+    """Load a checkpoint.
+
+    Args:
+        name: a folder, or the name of a checkpoint that ships with the package.
+        device: where the agent is to run.
+
+    Raises:
+        ValueError: there is no such checkpoint, or its files are broken or another model's.
+    """
+    folder = resolve_checkpoint(name)
+    agent = HierarchicalAgent(_read_config(folder / CONFIG))
+    try:
+        weights = load_file(folder / WEIGHTS)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{folder / WEIGHTS} is no complete safetensors file ({error}); copy or train it anew") from None
+    expected = {key: tuple(value.shape) for key, value in agent.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in weights.items()}
+    if expected != found:
+        odd = sorted(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
+        raise ValueError(
+            f"{folder / WEIGHTS} does not fit {CONFIG} beside it: {odd[0]} is {found.get(odd[0], 'missing')}, expected "
+            f"{expected.get(odd[0], 'absent')}; use the weights and the config of one training"
+        )
+    agent.load_state_dict(weights)
+    return agent.to(device)
+
+
+def _read_config(path: Path) -> AgentConfig:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        values["conv_channels"] = tuple(values["conv_channels"])
+        config = AgentConfig(**values)
+    except (ValueError, TypeError, KeyError) as error:
+        names = ", ".join(field.name for field in fields(AgentConfig))
+        raise ValueError(f"{path} is no agent config ({error!r}); it is a JSON object with {names}") from None
+    return config

@@ -1,0 +1,52 @@
+"""Evaluate a checkpoint on episodes: print the table, write the JSON.
+
+    python recipes/evaluate.py checkpoint=hierarchical-gs
+    python recipes/evaluate.py checkpoint=runs/seed1 episodes=mine.jsonl out=mine.json
+
+`checkpoint` is a folder or the name of a checkpoint that ships with the package; `episodes` is a JSON-lines file or
+`builtin`; `out` is the JSON file to write, none by default.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from ldrl.collectors import evaluate
+from ldrl.collectors.report import table, write_json
+from ldrl.envs import TownEnv, builtin_episodes, load_episodes
+from ldrl.modules import load_agent
+from ldrl.towns import LAYOUTS, Town
+
+
+@hydra.main(config_path="config", config_name="evaluate", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Check everything, then drive."""
+    try:
+        agent = load_agent(cfg.checkpoint, cfg.device)
+        if cfg.episodes == "builtin":
+            towns = {name: Town.load(name) for name in LAYOUTS}
+            episodes = [episode for town in towns.values() for episode in builtin_episodes(town)]
+        else:
+            episodes = load_episodes(cfg.episodes, LAYOUTS)
+            towns = {name: Town.load(name) for name in dict.fromkeys(episode.town for episode in episodes)}
+            for episode in episodes:
+                episode.route(towns[episode.town])
+        if cfg.out is not None:
+            write_json([], cfg.out)
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
+        outcomes = evaluate(agent, episodes, towns, num_cars=cfg.num_cars, device=cfg.device, progress=bar.update)
+    print(table(outcomes))
+    if cfg.out is not None:
+        write_json(outcomes, cfg.out)
+        print(f"Every episode's outcome is in {cfg.out}.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""The usual stack as a whole."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from ldrl import keys
+from ldrl.collectors.expert import Expert
+from ldrl.envs import DashCamera, make_env
+from ldrl.language import Tokenizer
+from ldrl.modules import HierarchicalAgent
+
+OBSERVED = (keys.IMAGE, keys.INSTRUCTION_TOKENS, keys.SUBTASK, keys.END_OF_SUBTASK, keys.POSE)
+
+
+@pytest.mark.parametrize("policy", [None, Expert, HierarchicalAgent])
+def test_specs_and_what_is_drawn_for_whom(town2, episodes, policy):
+    policy = Expert(town2) if policy is Expert else policy and policy()
+    check_env_specs(make_env(town2, 2, policy=policy))
+    env = make_env(town2, episodes=episodes["town2"][:3], policy=policy)
+    check_env_specs(env)
+    td = env.reset()
+    assert (keys.IMAGE in td.keys(True)) == (not isinstance(policy, Expert))
+    assert (keys.VOTES in td.keys(True)) == isinstance(policy, HierarchicalAgent)
+
+
+def test_roaming_cars_hear_training_sentences(town2):
+    env = make_env(town2, num_cars=4, max_steps=6)
+    assert env.batch_size == (4,)
+    rollout = env.rollout(20, Expert(town2))
+    assert rollout.shape == (4, 6)
+    assert rollout["next", "truncated"][:, -1].all()
+
+
+def test_episodes_bring_their_instructions(town2, episodes):
+    some = episodes["town2"][3:40:6]
+    td = make_env(town2, episodes=some).reset()
+    assert torch.equal(td[keys.INSTRUCTION_TOKENS], Tokenizer()([episode.instruction for episode in some]))
+    torch.testing.assert_close(td[keys.POSE], torch.tensor([episode.start for episode in some]))
+    assert torch.equal(td[keys.IMAGE], DashCamera(town2).draw(td[keys.POSE]))
+
+
+def test_same_seed_same_rollout_and_a_batch_row_alone(town2, episodes):
+    def rollout(seed, episodes=None):
+        env = make_env(town2, None if episodes else 4, episodes=episodes, max_steps=15, seed=seed)
+        return env.rollout(30, Expert(town2), break_when_any_done=False)
+
+    first, again, other = rollout(0), rollout(0), rollout(1)
+    for key in OBSERVED:
+        assert torch.equal(first[key], again[key])
+        assert key in (keys.SUBTASK, keys.END_OF_SUBTASK) or not torch.equal(first[key], other[key])
+    some = episodes["town2"][10:13]
+    together, alone = rollout(0, some), rollout(0, some[1:2])
+    for key in OBSERVED:
+        assert torch.equal(together[key][1], alone[key][0])
+
+
+def test_town_by_name():
+    env = make_env("town2", num_cars=1)
+    assert env.base_env.town.name == "town2"
+    with pytest.raises(ValueError, match=r"'atlantis'.*town1, town2"):
+        make_env("atlantis", num_cars=1)
