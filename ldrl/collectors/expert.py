@@ -17,7 +17,7 @@ CRUISE_SPEED = 20 / 3.6
 """Speed (paper), m/s."""
 SPEED_GAIN = 0.15 * 3.6
 """K_P of the longitudinal controller: 0.15 per km/h (paper's expert), s/m."""
-LOOK_AHEAD = 3.5
+LOOK_AHEAD = 3.0
 """The lateral controller steers for the point of the route this far ahead, m."""
 RESTING_THROTTLE = vehicle.ROLLING_RESISTANCE / vehicle.MAX_ACCELERATION
 """Throttle that holds a speed."""

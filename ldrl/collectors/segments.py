@@ -14,7 +14,7 @@ from torchrl.data.replay_buffers import Sampler, Storage
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.snippets import Snippets, cut_snippets
-from ldrl.language import KEYWORDS, Keyword, Sentences, Tokenizer, realised_by
+from ldrl.language import KEYWORDS, Sentences, Split, Tokenizer, realised_by
 from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
@@ -101,6 +101,7 @@ class BoundarySampler(Sampler):
         town: where they were driven.
         tokenizer: writes the instructions.
         max_junctions: see :func:`find_segments`.
+        split: which sentences are said.
         seed: of the sampler's own generator.
 
     Raises:
@@ -114,6 +115,7 @@ class BoundarySampler(Sampler):
         tokenizer: Tokenizer | None = None,
         *,
         max_junctions: int = 3,
+        split: Split = "train",
         seed: int = 0,
     ) -> None:
         stored = buffer.storage[:]
@@ -125,7 +127,7 @@ class BoundarySampler(Sampler):
             raise ValueError(f"no drive in {len(stored)} frames realises {', '.join(lacking)}; collect more")
         self.decisions = 2 * max_junctions + 1
         self._tokenizer = Tokenizer() if tokenizer is None else tokenizer
-        self._sentences = Sentences("train")
+        self._sentences = Sentences(split)
         self._words = [word for word in self._tokenizer.glove.words if word.isalpha()]
         self._random = random.Random(seed)
 

@@ -13,6 +13,7 @@ from torchrl.envs import TensorDictPrimer
 from ldrl import keys
 from ldrl.language import MAX_TOKENS
 from ldrl.modules.controller import VOTES, SwitchingController
+from ldrl.modules.encoders import ImageEncoder
 from ldrl.modules.high_level import HighLevelPolicy
 from ldrl.modules.low_level import LowLevelPolicy
 from ldrl.subtasks import SubTask
@@ -26,6 +27,7 @@ class AgentConfig:
 
     Args:
         image_channels: 1 for road segmentation.
+        image_rows: how many rows of the image the encoders see, from the bottom up.
         conv_channels: of each image encoder's convolutions.
         features: size of each linear layer behind an image encoder.
         low_level_hidden: size of a low-level GRU; there are four in each of the two networks.
@@ -35,10 +37,11 @@ class AgentConfig:
     """
 
     image_channels: int = 1
-    conv_channels: tuple[int, int, int] = (16, 32, 32)
+    image_rows: int = 48
+    conv_channels: tuple[int, int, int] = (16, 32, 64)
     features: int = 128
     low_level_hidden: int = 64
-    instruction_hidden: int = 32
+    instruction_hidden: int = 64
     subtask_embedding: int = 16
     high_level_hidden: int = 128
 
@@ -46,9 +49,11 @@ class AgentConfig:
     def paper(cls) -> AgentConfig:
         """The sizes of the paper's implementation."""
         return cls(
+            image_rows=88,
             conv_channels=(256, 64, 64),
             features=256,
             low_level_hidden=256,
+            instruction_hidden=32,
             subtask_embedding=64,
             high_level_hidden=256,
         )
@@ -75,16 +80,21 @@ class HierarchicalAgent(TensorDictModuleBase):
     def __init__(self, config: AgentConfig | None = None) -> None:
         super().__init__()
         self.config = config = AgentConfig() if config is None else config
-        image = {"in_channels": config.image_channels, "channels": config.conv_channels, "features": config.features}
-        low = {**image, "hidden": config.low_level_hidden}
+
+        def encoder() -> ImageEncoder:
+            return ImageEncoder(config.image_channels, config.conv_channels, config.image_rows)
+
         self.high_level = HighLevelPolicy(
-            **image,
+            encoder=encoder(),
+            channels=config.conv_channels[-1],
+            features=config.features,
             instruction=config.instruction_hidden,
             embedding=config.subtask_embedding,
             hidden=config.high_level_hidden,
         )
-        self.control = LowLevelPolicy("control", keys.ACTION, 2, **low)
-        self.end_of_subtask = LowLevelPolicy("end", keys.END_LOGIT, 1, **low)
+        sizes = {"features": config.features, "hidden": config.low_level_hidden}
+        self.control = LowLevelPolicy("control", keys.ACTION, 2, encoder=encoder(), **sizes)
+        self.end_of_subtask = LowLevelPolicy("end", keys.END_LOGIT, 1, encoder=encoder(), **sizes)
         self.controller = SwitchingController()
         self.in_keys = [keys.IMAGE, keys.INSTRUCTION_TOKENS, *self._memory]
         self.out_keys = [

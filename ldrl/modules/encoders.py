@@ -13,7 +13,7 @@ from ldrl.language import PADDING, WordEmbedding
 __all__ = ["ImageEncoder", "InstructionEncoder"]
 
 KERNELS = ((8, 4), (4, 2), (4, 2))
-"""Kernel size and stride of each convolution (paper's implementation); 88x200 becomes 3x10."""
+"""Kernel size and stride of each convolution (paper's implementation); 88x200 becomes 3x10, 48x200 becomes 1x10."""
 
 
 class ImageEncoder(nn.Module):
@@ -21,19 +21,28 @@ class ImageEncoder(nn.Module):
 
     Args:
         in_channels: channels of the image.
-        channels: channels after each convolution.
+        channels: channels after each convolution, ``C'`` the last.
+        rows: how many of the image's rows are looked at, from the bottom up. The road is in the lower half; without
+            the rest the encoder trains three times as fast.
+
+    Attributes:
+        out_features: ``C' H W``, the size of a flattened encoding.
 
     Examples:
         >>> ImageEncoder(1, (4, 4, 8))(torch.zeros(2, 5, 1, 88, 200, dtype=torch.uint8)).shape
         torch.Size([2, 5, 8, 3, 10])
     """
 
-    def __init__(self, in_channels: int, channels: Sequence[int]) -> None:
+    def __init__(self, in_channels: int, channels: Sequence[int], rows: int = 88) -> None:
         super().__init__()
+        self.rows = rows
+        height, width = rows, 200
         layers: list[nn.Module] = []
-        for width, (kernel, stride) in zip(channels, KERNELS, strict=True):
-            layers += [nn.Conv2d(in_channels, width, kernel, stride), nn.ELU()]
-            in_channels = width
+        for channel, (kernel, stride) in zip(channels, KERNELS, strict=True):
+            layers += [nn.Conv2d(in_channels, channel, kernel, stride), nn.ELU()]
+            in_channels = channel
+            height, width = ((size - kernel) // stride + 1 for size in (height, width))
+        self.out_features = in_channels * height * width
         # Channels last trains more than twice as fast on a CPU.
         self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
 
@@ -44,8 +53,9 @@ class ImageEncoder(nn.Module):
             image: ``[*B, C, 88, 200]`` uint8.
 
         Returns:
-            ``[*B, C', 3, 10]`` float32.
+            ``[*B, C', H, W]`` float32.
         """
+        image = image[..., -self.rows :, :]
         flat = image.reshape(-1, *image.shape[-3:]).to(self.layers[0].weight.dtype).div_(255)
         features = self.layers(flat.contiguous(memory_format=torch.channels_last))
         return features.reshape(*image.shape[:-3], *features.shape[1:])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -40,7 +38,7 @@ class HistoryDecoder(nn.Module):
         """Decide once.
 
         Args:
-            image: gated features, ``[B, C, 3, 10]`` float32.
+            image: gated features, ``[B, C, H, W]`` float32.
             previous: the sub-task before, ``[B]`` int64, ``NO_SUBTASK`` at an instruction's first decision.
             state: ``[B, H]`` float32, zero at an instruction's first decision.
 
@@ -58,8 +56,8 @@ class HighLevelPolicy(TensorDictSequential):
     sub-task history. It writes logits over the five sub-tasks and the decoder's next state.
 
     Args:
-        in_channels: channels of the image.
-        channels: of the convolutions.
+        encoder: of the images.
+        channels: of the encoder's last convolution.
         instruction: size of the instruction's GRU.
         features: size of the linear layer.
         embedding: size of the previous sub-task's embedding.
@@ -67,7 +65,7 @@ class HighLevelPolicy(TensorDictSequential):
     """
 
     def __init__(
-        self, *, in_channels: int, channels: Sequence[int], instruction: int, features: int, embedding: int, hidden: int
+        self, *, encoder: ImageEncoder, channels: int, instruction: int, features: int, embedding: int, hidden: int
     ) -> None:
         self.hidden = hidden
         words, is_word, said, image, gated = (
@@ -76,10 +74,10 @@ class HighLevelPolicy(TensorDictSequential):
         super().__init__(
             TensorDictModule(InstructionEncoder(instruction), [keys.INSTRUCTION_TOKENS], [words, is_word]),
             TensorDictModule(LuongAttention(instruction, hidden), [words, is_word, keys.HIGH_LEVEL_STATE], [said]),
-            TensorDictModule(ImageEncoder(in_channels, channels), [keys.IMAGE], [image]),
-            TensorDictModule(GatedAttention(instruction, channels[-1]), [image, said], [gated]),
+            TensorDictModule(encoder, [keys.IMAGE], [image]),
+            TensorDictModule(GatedAttention(instruction, channels), [image, said], [gated]),
             TensorDictModule(
-                HistoryDecoder(channels[-1] * 3 * 10, features, embedding, hidden),
+                HistoryDecoder(encoder.out_features, features, embedding, hidden),
                 [gated, keys.PREVIOUS_SUBTASK, keys.HIGH_LEVEL_STATE],
                 [keys.SUBTASK_LOGITS, ("next", *keys.HIGH_LEVEL_STATE)],
             ),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -65,8 +63,7 @@ class LowLevelPolicy(TensorDictSequential):
         name: of the network; its state and features are ``("agent", name, ...)``.
         out_key: where the head writes.
         outputs: size of the head.
-        in_channels: channels of the image.
-        channels: of the convolutions.
+        encoder: of the images.
         features: size of the linear layer.
         hidden: size of each GRU.
     """
@@ -77,18 +74,17 @@ class LowLevelPolicy(TensorDictSequential):
         out_key: NestedKey,
         outputs: int,
         *,
-        in_channels: int,
-        channels: Sequence[int],
+        encoder: ImageEncoder,
         features: int,
         hidden: int,
     ) -> None:
         self.hidden = hidden
         self.state_key = (keys.AGENT, f"{name}_state")
         image, encoded, decoded = ((keys.AGENT, f"{name}_{part}") for part in ("image", "features", "decoded"))
-        flat = channels[-1] * 3 * 10
+        linear = nn.Sequential(nn.Flatten(-3), nn.Linear(encoder.out_features, features), nn.ELU())
         super().__init__(
-            TensorDictModule(ImageEncoder(in_channels, channels), [keys.IMAGE], [image]),
-            TensorDictModule(nn.Sequential(nn.Flatten(-3), nn.Linear(flat, features), nn.ELU()), [image], [encoded]),
+            TensorDictModule(encoder, [keys.IMAGE], [image]),
+            TensorDictModule(linear, [image], [encoded]),
             TensorDictModule(
                 BranchedGRU(features, hidden),
                 [encoded, keys.AGENT_SUBTASK, self.state_key],
