@@ -10,15 +10,14 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ldrl.collectors import evaluate
-from ldrl.collectors.report import table, write_json
-from ldrl.envs import TownEnv, builtin_episodes, load_episodes
+from ldrl.collectors.report import check_writable, table, write_json
+from ldrl.envs import builtin_episodes, load_episodes
 from ldrl.modules import load_agent
 from ldrl.towns import LAYOUTS, Town
 
@@ -37,7 +36,7 @@ def main(cfg: DictConfig) -> None:
             for episode in episodes:
                 episode.route(towns[episode.town])
         if cfg.out is not None:
-            write_json([], cfg.out)
+            check_writable(cfg.out)
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:

@@ -115,6 +115,7 @@ def evaluate(
 @torch.no_grad()
 def _drive(env: EnvBase, policy: TensorDictModuleBase, episodes: Sequence[Episode]) -> list[Outcome]:
     """Drive one batch, each row until its own end."""
+    policy.eval()
     tensordict = env.reset()
     frames = [tensordict.select(*RECORDED)]
     running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)

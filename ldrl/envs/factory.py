@@ -50,6 +50,6 @@ def make_env(
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
         transforms.append(DashCamera(town).to(device))
-    if hasattr(policy, "make_tensordict_primer"):
+    if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms.append(policy.make_tensordict_primer())
     return TransformedEnv(env, Compose(*transforms))

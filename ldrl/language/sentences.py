@@ -38,7 +38,7 @@ class Sentences:
     Examples:
         >>> sentences = Sentences("train")
         >>> sentences.count("left")
-        119
+        128
         >>> next(sentences.all("(second, left)"))
         'take the second left'
         >>> sentences.sample("left,right", random.Random(0))

@@ -34,6 +34,9 @@ class AgentConfig:
         instruction_hidden: size of the instruction's GRU.
         subtask_embedding: size of the previous sub-task's embedding.
         high_level_hidden: size of the high-level GRU.
+
+    Raises:
+        ValueError: a size is no whole number above 0.
     """
 
     image_channels: int = 1
@@ -44,6 +47,15 @@ class AgentConfig:
     instruction_hidden: int = 64
     subtask_embedding: int = 16
     high_level_hidden: int = 128
+
+    def __post_init__(self) -> None:
+        sizes = {name: value for name, value in vars(self).items() if name != "conv_channels"}
+        if len(self.conv_channels) != 3:
+            raise ValueError(f"conv_channels is {self.conv_channels!r}; give three sizes, one for each convolution")
+        for name, value in (*sizes.items(), *(("conv_channels", value) for value in self.conv_channels)):
+            if type(value) is not int or value < 1:
+                raise ValueError(f"{name} is {value!r}; give a whole number above 0")
+        object.__setattr__(self, "conv_channels", tuple(self.conv_channels))
 
     @classmethod
     def paper(cls) -> AgentConfig:

@@ -57,7 +57,7 @@ def resolve_checkpoint(name: str | Path) -> Path:
 
 
 def load_agent(name: str | Path, device: torch.device | str = "cpu") -> HierarchicalAgent:
-    """Load a checkpoint.
+    """Load a checkpoint, ready to drive (in evaluation mode).
 
     Args:
         name: a folder, or the name of a checkpoint that ships with the package.
@@ -67,11 +67,13 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Hierarch
         ValueError: there is no such checkpoint, or its files are broken or another model's.
     """
     folder = resolve_checkpoint(name)
-    agent = HierarchicalAgent(_read_config(folder / CONFIG))
+    agent = _untrained(folder / CONFIG)
     try:
         weights = load_file(folder / WEIGHTS)
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{folder / WEIGHTS} is no complete safetensors file ({error}); copy or train it anew") from None
+        raise ValueError(
+            f"{folder / WEIGHTS} is no complete safetensors file ({error}); copy or train it anew"
+        ) from None
     expected = {key: tuple(value.shape) for key, value in agent.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in weights.items()}
     if expected != found:
@@ -81,15 +83,13 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Hierarch
             f"{expected.get(odd[0], 'absent')}; use the weights and the config of one training"
         )
     agent.load_state_dict(weights)
-    return agent.to(device)
+    return agent.eval().to(device)
 
 
-def _read_config(path: Path) -> AgentConfig:
+def _untrained(path: Path) -> HierarchicalAgent:
+    """The agent of a config file, with random weights."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        values["conv_channels"] = tuple(values["conv_channels"])
-        config = AgentConfig(**values)
-    except (ValueError, TypeError, KeyError) as error:
+        return HierarchicalAgent(AgentConfig(**json.loads(path.read_text(encoding="utf-8"))))
+    except (ValueError, TypeError, RuntimeError) as error:
         names = ", ".join(field.name for field in fields(AgentConfig))
-        raise ValueError(f"{path} is no agent config ({error!r}); it is a JSON object with {names}") from None
-    return config
+        raise ValueError(f"{path} is no agent config ({error}); it is a JSON object with {names}") from None

@@ -28,6 +28,9 @@ class ImageEncoder(nn.Module):
     Attributes:
         out_features: ``C' H W``, the size of a flattened encoding.
 
+    Raises:
+        ValueError: ``rows`` is not in 44 to 88.
+
     Examples:
         >>> ImageEncoder(1, (4, 4, 8))(torch.zeros(2, 5, 1, 88, 200, dtype=torch.uint8)).shape
         torch.Size([2, 5, 8, 3, 10])
@@ -42,9 +45,11 @@ class ImageEncoder(nn.Module):
             layers += [nn.Conv2d(in_channels, channel, kernel, stride), nn.ELU()]
             in_channels = channel
             height, width = ((size - kernel) // stride + 1 for size in (height, width))
+        if height < 1 or rows > 88:
+            raise ValueError(f"rows is {rows}; an image has 88, and the convolutions need at least 44 of them")
         self.out_features = in_channels * height * width
         # Channels last trains more than twice as fast on a CPU.
-        self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
+        self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, image: Tensor) -> Tensor:
         """Encode images.
@@ -64,8 +69,13 @@ class ImageEncoder(nn.Module):
 class InstructionEncoder(nn.Module):
     """Frozen GloVe vectors through a single-layer GRU.
 
+    In training the vectors are disturbed, so that words with like vectors come to count alike and a sentence is
+    understood that was never trained on.
+
     Args:
         hidden: size of the GRU's state.
+        noise: standard deviation of Gaussian noise on the vectors in training.
+        dropout: share of their components that is dropped in training.
 
     Examples:
         >>> states, is_word = InstructionEncoder(32)(torch.tensor([[5, 6, 0, 0]]))
@@ -73,9 +83,11 @@ class InstructionEncoder(nn.Module):
         (torch.Size([1, 4, 32]), tensor([[ True,  True, False, False]]))
     """
 
-    def __init__(self, hidden: int) -> None:
+    def __init__(self, hidden: int, noise: float = 0.15, dropout: float = 0.1) -> None:
         super().__init__()
         self.embedding = WordEmbedding()
+        self.noise = noise
+        self.dropout = nn.Dropout(dropout)
         self.gru = nn.GRU(50, hidden, batch_first=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,6 +103,9 @@ class InstructionEncoder(nn.Module):
         flat = tokens.reshape(-1, tokens.shape[-1])
         is_word = flat != PADDING
         length = is_word.sum(-1).clamp(min=1).cpu()
-        packed = pack_padded_sequence(self.embedding(flat), length, batch_first=True, enforce_sorted=False)
+        vectors = self.embedding(flat)
+        if self.training:
+            vectors = self.dropout(vectors + self.noise * torch.randn_like(vectors))
+        packed = pack_padded_sequence(vectors, length, batch_first=True, enforce_sorted=False)
         states, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=tokens.shape[-1])
         return states.view(*tokens.shape, -1), is_word.view(tokens.shape)

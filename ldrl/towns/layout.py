@@ -110,8 +110,8 @@ class Layout:
         width = max(node.x for node in self.nodes.values()) - min(node.x for node in self.nodes.values()) + 250.0
         nodes, streets = dict(self.nodes), list(self.streets)
         for copy in range(1, copies):
-            for name, (x, y, radius) in self.nodes.items():
-                radius = max(self.lane_width, radius * rng.uniform(0.7, 1.2))
+            for name, (x, y, given) in self.nodes.items():
+                radius = max(self.lane_width, given * rng.uniform(0.7, 1.2))
                 nodes[f"{name}.{copy}"] = Node(x + copy * width, y, radius)
             streets += [tuple(f"{name}.{copy}" for name in street) for street in self.streets]
         return Layout(self.name, self.lane_width, nodes, tuple(streets))

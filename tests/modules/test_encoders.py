@@ -1,0 +1,106 @@
+"""The two encoders."""
+
+import pytest
+import torch
+
+from ldrl.language import Tokenizer, WordEmbedding
+from ldrl.modules import ImageEncoder, InstructionEncoder
+
+
+@pytest.fixture
+def encoder():
+    torch.manual_seed(0)
+    return InstructionEncoder(6).eval()
+
+
+@pytest.mark.parametrize(("rows", "channels"), [(88, (2, 3, 4)), (88, (8, 2, 5)), (48, (2, 3, 4))])
+def test_image_features(rows, channels):
+    encoder = ImageEncoder(3, channels, rows)
+    images = torch.randint(0, 256, (2, 5, 3, 88, 200), dtype=torch.uint8)
+    features = encoder(images)
+    assert features.shape[:3] == (2, 5, channels[-1])
+    assert features[0, 0].numel() == encoder.out_features
+    for i in range(2):
+        alone = images[i, 3, :, 88 - rows :].float() / 255
+        for layer in encoder.layers:
+            alone = layer(alone)
+        torch.testing.assert_close(features[i, 3], alone)
+    assert features.requires_grad
+
+
+def test_paper_size_of_image_features():
+    assert ImageEncoder(1, (2, 2, 64)).out_features == 64 * 3 * 10
+
+
+def test_only_the_lower_rows_are_seen():
+    encoder = ImageEncoder(1, (2, 3, 4), 48)
+    image = torch.randint(0, 256, (1, 1, 88, 200), dtype=torch.uint8)
+    sky, road = image.clone(), image.clone()
+    sky[..., :40, :] = 255 - sky[..., :40, :]
+    road[..., 40, :] = 255 - road[..., 40, :]
+    assert torch.equal(encoder(sky), encoder(image))
+    assert not torch.equal(encoder(road), encoder(image))
+
+
+def test_images_are_not_changed():
+    image = torch.full((1, 1, 88, 200), 255, dtype=torch.uint8)
+    ImageEncoder(1, (2, 3, 4))(image)
+    assert (image == 255).all()
+
+
+def test_words_against_the_plain_recurrence(encoder):
+    tokens = Tokenizer(max_tokens=7)(["turn left", "take the second right please", "straight"])
+    states, is_word = encoder(tokens)
+    assert states.shape == (3, 7, 6)
+    cell = torch.nn.GRUCell(50, 6)
+    cell.load_state_dict({name.removesuffix("_l0"): value for name, value in encoder.gru.state_dict().items()})
+    for row, length in enumerate((2, 5, 1)):
+        state = torch.zeros(1, 6)
+        for k in range(length):
+            state = cell(WordEmbedding()(tokens[row, k : k + 1]), state)
+            torch.testing.assert_close(states[row, k], state[0])
+        assert is_word[row].tolist() == [True] * length + [False] * (7 - length)
+        assert not states[row, length:].any()
+
+
+def test_padding_and_batch_do_not_matter(encoder):
+    sentences = ["turn left", "take the second right please", "zzyzzyx left"]
+    states, _ = encoder(Tokenizer(max_tokens=6)(sentences))
+    longer, _ = encoder(Tokenizer(max_tokens=40)(sentences))
+    torch.testing.assert_close(longer[:, :6], states)
+    for row, sentence in enumerate(sentences):
+        alone, _ = encoder(Tokenizer(max_tokens=6)([sentence]))
+        torch.testing.assert_close(alone[0], states[row])
+
+
+def test_any_batch_shape(encoder):
+    tokens = Tokenizer(max_tokens=4)(["left", "go right", "turn", "second left", "take it", "a left"])
+    nested, is_word = encoder(tokens.view(2, 3, 4))
+    torch.testing.assert_close(nested.view(6, 4, 6), encoder(tokens)[0])
+    assert torch.equal(is_word.view(6, 4), tokens != 0)
+
+
+def test_nothing_but_padding(encoder):
+    tokens = Tokenizer(max_tokens=4)(["turn left", "right"])
+    tokens[1] = 0
+    states, is_word = encoder(tokens)
+    assert not is_word[1].any()
+    assert states.isfinite().all()
+    states[0].sum().backward()
+    assert encoder.gru.weight_ih_l0.grad.isfinite().all()
+
+
+def test_words_are_disturbed_in_training_only(encoder):
+    tokens = Tokenizer(max_tokens=4)(["turn left", "right"])
+    quiet, _ = encoder(tokens)
+    assert torch.equal(encoder(tokens)[0], quiet)
+    encoder.train()
+    noisy, is_word = encoder(tokens)
+    assert not torch.allclose(noisy[0, 0], quiet[0, 0])
+    assert not noisy[~is_word].any()
+    assert torch.equal(encoder.eval()(tokens)[0], quiet)
+
+
+def test_word_vectors_are_not_trained_and_not_saved(encoder):
+    assert {name.split(".")[0] for name in encoder.state_dict()} == {"gru"}
+    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == {"gru"}
