@@ -71,9 +71,9 @@ CROSS_TRACK_ERROR = (WORLD, "cross_track_error")
 OFF_ROAD = (WORLD, "off_road")
 """Whether a corner of the footprint is off the drivable surface, ``[*B, 1]`` bool."""
 WRONG_LANE = (WORLD, "wrong_lane")
-"""Whether the footprint is in an oncoming lane outside junctions, ``[*B, 1]`` bool."""
+"""Whether two corners of the footprint are in an oncoming lane outside junctions, ``[*B, 1]`` bool."""
 COLLISION = (WORLD, "collision")
-"""Whether the footprint touches a building, ``[*B, 1]`` bool."""
+"""Whether the footprint touches a building, 4 m beyond the road's edge, ``[*B, 1]`` bool."""
 
 AGENT = "agent"
 """The agent's own keys; it reads the root's and writes those of the next step."""

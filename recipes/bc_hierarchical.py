@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 from ldrl.collectors import BoundarySampler, DisturbedView, SnippetSampler, collect_demonstrations, evaluate
 from ldrl.collectors.plots import plot_losses, plot_tracks
-from ldrl.collectors.report import table, to_markdown, write_json
+from ldrl.collectors.report import replacing, table, to_markdown, write_json
 from ldrl.envs import DashCamera, Episode, builtin_episodes
 from ldrl.modules import AgentConfig, HierarchicalAgent, save_agent
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, SubtaskLoss
@@ -50,13 +50,13 @@ def fit(
     history: History = defaultdict(list)
 
     def update(batch: TensorDictBase) -> dict[str, float]:
-        measured = {name: value for loss in losses for name, value in loss(batch).items()}
-        sum(value for name, value in measured.items() if name.startswith("loss_")).backward()
+        outputs = [loss(batch) for loss in losses]
+        sum(value for output in outputs for name, value in output.items() if name.startswith("loss_")).backward()
         torch.nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
         optimizer.step()
         optimizer.zero_grad()
         schedule.step()
-        return {name: float(value) for name, value in measured.items()}
+        return {name: float(value) for output in outputs for name, value in output.items()}
 
     bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
     for step in bar:
@@ -150,7 +150,8 @@ def main(cfg: DictConfig) -> None:
         "Versions": f"Python {platform.python_version()}, torch {torch.__version__}",
     }
     report = to_markdown(outcomes, title=cfg.name, details=details)
-    (folder / "report.md").write_text(report, encoding="utf-8")
+    with replacing(folder / "report.md") as file:
+        file.write_text(report, encoding="utf-8")
     print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{cfg.town}.png.")
 
 

@@ -38,7 +38,7 @@ class SteeringNoise(TensorDictModuleBase):
     """Pushes cars off their line: adds smooth noise to the steer, in bursts with pauses in which the car recovers.
 
     The noise is ``scale`` times a first-order autoregressive process of unit variance, cut to what lies beyond one
-    standard deviation. Its state is a key of the TensorDict's own, so cars are independent.
+    standard deviation. Each car has a process of its own.
 
     Args:
         scale: of the noise, in units of full steer.
@@ -72,7 +72,7 @@ class SteeringNoise(TensorDictModuleBase):
 def collect_demonstrations(
     town: Town, frames: int, *, num_cars: int = 128, path: str | Path | None = None, noise: float = 0.15, seed: int = 0
 ) -> TensorDictReplayBuffer:
-    """Let the expert roam, with disturbed steering, and store every frame in 60 bytes.
+    """Let the expert roam, with disturbed steering, and store every frame in 68 bytes.
 
     A frame is the pose, speed and route, the action that was driven and the sub-task's labels; images are drawn from
     poses when sampled. The expert's own action at any state is :func:`~ldrl.collectors.expert_action`.

@@ -11,10 +11,8 @@ from ldrl import keys
 from ldrl.envs import vehicle
 from ldrl.towns import Town
 
-__all__ = ["CRUISE_SPEED", "Expert", "expert_action"]
+__all__ = ["Expert", "expert_action"]
 
-CRUISE_SPEED = 20 / 3.6
-"""Speed (paper), m/s."""
 SPEED_GAIN = 0.15 * 3.6
 """K_P of the longitudinal controller: 0.15 per km/h (paper's expert), s/m."""
 LOOK_AHEAD = 3.0
@@ -46,7 +44,7 @@ def expert_action(town: Town, pose: Tensor, speed: Tensor, route: Tensor, positi
     cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
     forward = offset[..., 0] * cos + offset[..., 1] * sin
     right = offset[..., 1] * cos - offset[..., 0] * sin
-    throttle = (RESTING_THROTTLE + SPEED_GAIN * (CRUISE_SPEED - speed)).clamp(0, 1)
+    throttle = (RESTING_THROTTLE + SPEED_GAIN * (vehicle.CRUISE_SPEED - speed)).clamp(0, 1)
     return torch.stack((throttle, vehicle.steer_towards(forward, right)), -1)
 
 

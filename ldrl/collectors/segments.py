@@ -14,7 +14,7 @@ from torchrl.data.replay_buffers import Sampler, Storage
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.snippets import Snippets, cut_snippets
-from ldrl.language import KEYWORDS, Sentences, Split, Tokenizer, realised_by
+from ldrl.language import KEYWORDS, MEANINGFUL, Sentences, Split, Tokenizer, disturb, realised_by
 from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
@@ -28,6 +28,8 @@ ANYWHERE = 0.25
 """Share of instructions given anywhere on the way to the first manoeuvre."""
 BOUNDARY = (-4, 8)
 """Frames around a boundary in which a decision may fall: a sub-task is voted to have ended a little early or late."""
+FREQUENT = 20_000
+"""How many of the most frequent words disturb a sentence or make up nonsense."""
 NONSENSE = 0.03
 """Share of instructions that nobody understands, known and unknown words at random: the safe answer is to stop."""
 
@@ -102,6 +104,7 @@ class BoundarySampler(Sampler):
         tokenizer: writes the instructions.
         max_junctions: see :func:`find_segments`.
         split: which sentences are said.
+        disturbed: share of them that is disturbed, see :func:`~ldrl.language.disturb`.
         seed: of the sampler's own generator.
 
     Raises:
@@ -116,6 +119,7 @@ class BoundarySampler(Sampler):
         *,
         max_junctions: int = 3,
         split: Split = "train",
+        disturbed: float = 0.7,
         seed: int = 0,
     ) -> None:
         stored = buffer.storage[:]
@@ -128,7 +132,10 @@ class BoundarySampler(Sampler):
         self.decisions = 2 * max_junctions + 1
         self._tokenizer = Tokenizer() if tokenizer is None else tokenizer
         self._sentences = Sentences(split)
-        self._words = [word for word in self._tokenizer.glove.words if word.isalpha()]
+        self.disturbed = disturbed
+        # GloVe's rows are sorted by frequency: what people say is among the first.
+        frequent = list(self._tokenizer.glove.words)[:FREQUENT]
+        self._words = [word for word in frequent if word.isalpha() and word not in MEANINGFUL]
         self._random = random.Random(seed)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[Any, Tensor]]:
@@ -148,6 +155,8 @@ class BoundarySampler(Sampler):
             keyword = self._random.choice(list(KEYWORDS.values()))
             sequence = self._decisions(self._random.choice(self._segments[keyword.name]))
             sentence = self._sentences.sample(keyword, self._random)
+            if self._random.random() < self.disturbed:
+                sentence = disturb(sentence, self._words, self._random)
             if self._random.random() < NONSENSE:
                 sequence = [(sequence[0][0], SubTask.FINISH)]
                 unknown = self._random.random()

@@ -31,8 +31,6 @@ STANDING_SPEED = 0.1
 """Below it a car stands, m/s."""
 STANDING_STEPS = 30
 """A car that stands this long has ended its drive."""
-CRUISE_SPEED = 20 / 3.6
-"""The expert's speed (paper), m/s."""
 PATIENCE = 15.0
 """Time beyond one and a half times what the path needs at cruise speed before an episode is cut off, s."""
 
@@ -136,7 +134,7 @@ class TownEnv(EnvBase):
         self._plan_start = torch.tensor([route.start for route in routes], device=self.device)
         self._plan_pose = torch.tensor([e.start for e in episodes], dtype=torch.float64, device=self.device)
         self._goal = torch.tensor([route.length for route in routes], device=self.device)
-        seconds = [1.5 * route.length / CRUISE_SPEED + PATIENCE for route in routes]
+        seconds = [1.5 * route.length / vehicle.CRUISE_SPEED + PATIENCE for route in routes]
         self._limit = torch.tensor([math.ceil(s / vehicle.TIME_STEP) for s in seconds], device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:

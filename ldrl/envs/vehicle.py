@@ -9,6 +9,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from torch import Tensor
 
 __all__ = [
+    "CRUISE_SPEED",
     "INITIAL_SPEED",
     "LENGTH",
     "MAX_ACCELERATION",
@@ -28,6 +29,8 @@ WIDTH = Vehicle.WIDTH
 """m."""
 TIME_STEP = 0.1
 """10 Hz, s."""
+CRUISE_SPEED = 20 / 3.6
+"""Speed that an expert keeps (paper), m/s."""
 INITIAL_SPEED = 4.7
 """Speed at the start of an episode (paper's evaluation), m/s."""
 MAX_STEERING_ANGLE = math.pi / 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ldrl.language.disturb import MEANINGFUL, disturb
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
 from ldrl.language.sentences import Sentences, Split
@@ -11,6 +12,7 @@ __all__ = [
     "DIMENSIONS",
     "KEYWORDS",
     "MAX_TOKENS",
+    "MEANINGFUL",
     "PADDING",
     "UNKNOWN",
     "Glove",
@@ -19,6 +21,7 @@ __all__ = [
     "Split",
     "Tokenizer",
     "WordEmbedding",
+    "disturb",
     "load_glove",
     "normalise",
     "realised_by",

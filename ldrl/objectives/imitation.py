@@ -24,6 +24,7 @@ class _LowLevelLoss(LossModule):
 
     policy: TensorDictModuleBase
     policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
 
     def __init__(self, policy: LowLevelPolicy) -> None:
         super().__init__()
@@ -99,13 +100,13 @@ class EndOfSubtaskLoss(_LowLevelLoss):
             tensordict: slices, batch size ``[B, T]``: image, ``subtask`` and ``end_of_subtask``.
 
         Returns:
-            ``loss_end_of_subtask``, a scalar, and ``accuracy``, the share of steps decided right.
+            ``loss_end_of_subtask``, a scalar, and ``accuracy_end_of_subtask``, the share of steps decided right.
         """
         logit = self._run(tensordict)[keys.END_LOGIT].squeeze(-1)
         ended = tensordict[self.tensor_keys.end_of_subtask]
         loss = functional.binary_cross_entropy_with_logits(logit, ended.float())
         accuracy = ((logit > 0) == ended).float().mean()
-        return TensorDict({"loss_end_of_subtask": loss, "accuracy": accuracy})
+        return TensorDict({"loss_end_of_subtask": loss, "accuracy_end_of_subtask": accuracy})
 
 
 class SubtaskLoss(LossModule):
@@ -125,6 +126,7 @@ class SubtaskLoss(LossModule):
     out_keys = ["loss_subtask"]  # noqa: RUF012
     policy: TensorDictModuleBase
     policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
 
     def __init__(self, policy: HighLevelPolicy) -> None:
         super().__init__()
@@ -140,7 +142,8 @@ class SubtaskLoss(LossModule):
             "previous_subtask")``, the right ``subtask``, and ``mask``, False for padding, which is at the end.
 
         Returns:
-            ``loss_subtask``, a scalar, zero where all is padding, and ``accuracy``, the share of decisions made right.
+            ``loss_subtask``, a scalar, zero where all is padding, and ``accuracy_subtask``, the share of
+            decisions made right.
         """
         mask, target = tensordict[self.tensor_keys.mask], tensordict[self.tensor_keys.subtask]
         logits = self._decide(tensordict, mask)
@@ -148,7 +151,7 @@ class SubtaskLoss(LossModule):
         decisions = max(len(target), 1)
         loss = functional.cross_entropy(logits, target, reduction="sum") / decisions
         accuracy = (logits.argmax(-1) == target).float().sum() / decisions
-        return TensorDict({"loss_subtask": loss, "accuracy": accuracy})
+        return TensorDict({"loss_subtask": loss, "accuracy_subtask": accuracy})
 
     def _decide(self, tensordict: TensorDictBase, mask: Tensor) -> Tensor:
         """Logits of all decisions that are not padding, step by step: ``[mask.sum(), 5]``."""
