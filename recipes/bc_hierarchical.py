@@ -40,7 +40,12 @@ History = dict[str, list[float]]
 
 
 def fit(
-    cfg: DictConfig, title: str, losses: Sequence[LossModule], buffer: TensorDictReplayBuffer, rows: int, logger: CSVLogger
+    cfg: DictConfig,
+    title: str,
+    losses: Sequence[LossModule],
+    buffer: TensorDictReplayBuffer,
+    rows: int,
+    logger: CSVLogger,
 ) -> History:
     """Minimise losses together over ``cfg[title].steps`` batches of ``rows`` sequences."""
     parameters = [parameter for loss in losses for parameter in loss.parameters()]

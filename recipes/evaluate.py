@@ -27,14 +27,11 @@ def main(cfg: DictConfig) -> None:
     """Check everything, then drive."""
     try:
         agent = load_agent(cfg.checkpoint, cfg.device)
+        towns = {name: Town.load(name) for name in LAYOUTS}
         if cfg.episodes == "builtin":
-            towns = {name: Town.load(name) for name in LAYOUTS}
             episodes = [episode for town in towns.values() for episode in builtin_episodes(town)]
         else:
-            episodes = load_episodes(cfg.episodes, LAYOUTS)
-            towns = {name: Town.load(name) for name in dict.fromkeys(episode.town for episode in episodes)}
-            for episode in episodes:
-                episode.route(towns[episode.town])
+            episodes = load_episodes(cfg.episodes, towns)
         if cfg.out is not None:
             check_writable(cfg.out)
     except (OSError, ValueError) as error:

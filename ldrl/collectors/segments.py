@@ -45,9 +45,7 @@ class Segment:
     snippets: tuple[int, ...]
 
 
-def find_segments(
-    town: Town, snippets: Snippets, lane: Tensor, max_junctions: int = 3
-) -> dict[str, list[Segment]]:
+def find_segments(town: Town, snippets: Snippets, lane: Tensor, max_junctions: int = 3) -> dict[str, list[Segment]]:
     """Find every segment of drives that realises a keyword.
 
     Args:

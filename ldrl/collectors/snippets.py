@@ -181,9 +181,12 @@ class DisturbedView(Transform):
         """Move the poses and write the expert's actions there."""
         slices = -(-tensordict.numel() // self.slice_length)
         pose = tensordict[keys.POSE]
-        lateral, yaw = torch.randn(2, slices, generator=self._generator).clamp(-3, 3).to(pose.device).repeat_interleave(
-            self.slice_length, 1
-        )[:, : len(pose)]
+        lateral, yaw = (
+            torch.randn(2, slices, generator=self._generator)
+            .clamp(-3, 3)
+            .to(pose.device)
+            .repeat_interleave(self.slice_length, 1)[:, : len(pose)]
+        )
         pose = shift(pose, self.lateral * lateral, self.yaw * yaw)
         tensordict[keys.POSE] = pose
         speed, position = tensordict[keys.SPEED].squeeze(-1), tensordict[keys.ROUTE_POSITION].squeeze(-1)

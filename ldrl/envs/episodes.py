@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -136,15 +136,16 @@ def save_episodes(episodes: Iterable[Episode], path: str | Path) -> None:
     Path(path).write_text("".join(json.dumps(asdict(episode)) + "\n" for episode in episodes), encoding="utf-8")
 
 
-def load_episodes(path: str | Path, towns: Sequence[str] | None = None) -> list[Episode]:
+def load_episodes(path: str | Path, towns: Mapping[str, Town] | None = None) -> list[Episode]:
     """Read an episode file.
 
     Args:
         path: JSON lines, one episode each; blank lines are skipped.
-        towns: the names that are allowed; None allows all.
+        towns: by name, to check every start and path against; None checks neither these nor the towns' names.
 
     Raises:
-        ValueError: the file has no episode, or a line is broken; the message names the file and the line.
+        ValueError: the file has no episode, or a line is broken, or its episode does not lie on the roads of its
+            town; the message names the file and the line.
         FileNotFoundError: there is no such file.
     """
     if not Path(path).is_file():
@@ -166,7 +167,7 @@ def load_episodes(path: str | Path, towns: Sequence[str] | None = None) -> list[
     return episodes
 
 
-def _parse(line: str, towns: Sequence[str] | None) -> Episode:
+def _parse(line: str, towns: Mapping[str, Town] | None) -> Episode:
     try:
         record = json.loads(line)
     except json.JSONDecodeError as error:
@@ -177,6 +178,8 @@ def _parse(line: str, towns: Sequence[str] | None) -> Episode:
     if missing:
         raise ValueError(f"{', '.join(missing)} missing; an episode has {', '.join(FIELDS)}")
     episode = Episode(**{name: record[name] for name in FIELDS})
-    if towns is not None and episode.town not in towns:
-        raise ValueError(f"unknown town {episode.town!r}; use one of {', '.join(towns)}")
+    if towns is not None:
+        if episode.town not in towns:
+            raise ValueError(f"unknown town {episode.town!r}; use one of {', '.join(towns)}")
+        episode.route(towns[episode.town])
     return episode

@@ -8,7 +8,6 @@ one lane each way. So the right of a heading ``(cos h, sin h)`` is ``(-sin h, co
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -93,28 +92,6 @@ class Layout:
             raise ValueError(f"layout {name!r}: streets must be a list of lists of node names, got {streets!s:.200}")
         nodes = {node: Node(*values) for node, values in nodes.items()}
         return cls(name, data["lane_width"], nodes, tuple(map(tuple, streets)))
-
-    def varied(self, copies: int, seed: int = 0) -> Layout:
-        """This layout and copies of it beside it, whose corners and junctions turn tighter or wider.
-
-        One fixed radius per corner teaches a driver when to turn, not to look where the corner is.
-
-        Args:
-            copies: how many in all, the first as it is.
-            seed: of the radii, 0.7 to 1.2 times this layout's.
-
-        Returns:
-            One layout, the copies 250 m apart.
-        """
-        rng = random.Random(seed)
-        width = max(node.x for node in self.nodes.values()) - min(node.x for node in self.nodes.values()) + 250.0
-        nodes, streets = dict(self.nodes), list(self.streets)
-        for copy in range(1, copies):
-            for name, (x, y, given) in self.nodes.items():
-                radius = max(self.lane_width, given * rng.uniform(0.7, 1.2))
-                nodes[f"{name}.{copy}"] = Node(x + copy * width, y, radius)
-            streets += [tuple(f"{name}.{copy}" for name in street) for street in self.streets]
-        return Layout(self.name, self.lane_width, nodes, tuple(streets))
 
     def network(self) -> RoadNetwork:
         """Expand the layout.

@@ -16,8 +16,8 @@ LINE = {
     "town": "town1",
     "keyword": "left",
     "instruction": "turn left",
-    "start": [1.0, 2.0, 0.5],
-    "path": [[1.0, 2.0], [3.0, 4]],
+    "start": [40.0, 2.0, 0.0],
+    "path": [[40.0, 2.0], [45.0, 2]],
 }
 
 
@@ -128,12 +128,15 @@ def test_odd_instructions_are_no_errors(tmp_path, instruction):
         ({**LINE, "path": [[1, 2], [1, 2, 3]]}, r"path point 1 is \[1, 2, 3\]; give 2 finite numbers"),
         ({**LINE, "path": [[1, 2], [math.nan, 2]]}, r"path point 1 is \[nan, 2\]; give 2 finite numbers"),
         ({**LINE, "path": [1, 2]}, "path point 0 is 1; give 2 finite numbers"),
+        ({**LINE, "start": [40, 30, 0]}, "episode 'a': start .* is 2.* m from the nearest lane of 'town1'; move it"),
+        ({**LINE, "start": [40, 2, 3.1]}, "episode 'a': start .* faces against its lane"),
+        ({**LINE, "path": [[45, 2], [50, 20]]}, "episode 'a': path point 1 .* is 1.* m from the nearest lane"),
     ],
 )
-def test_broken_lines_are_named(tmp_path, line, message):
+def test_broken_lines_are_named(tmp_path, towns, line, message):
     path = write(tmp_path, LINE, "", line, LINE)
     with pytest.raises(ValueError, match=rf"episodes\.jsonl, line 3: {message}"):
-        load_episodes(path, towns=("town1", "town2"))
+        load_episodes(path, towns)
 
 
 def test_broken_files_are_named(tmp_path):
