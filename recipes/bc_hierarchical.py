@@ -123,17 +123,17 @@ def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
 @hydra.main(config_path="config", config_name="bc_hierarchical", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Run all stages."""
-    folder = Path("runs") / cfg.name
+    folder = Path("runs") / str(cfg.name)
+    torch.manual_seed(cfg.seed)
     try:
+        towns = {name: Town.load(name) for name in (cfg.town, cfg.test_town)}
+        agent = HierarchicalAgent(AgentConfig(**OmegaConf.to_container(cfg.model))).to(cfg.device)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
-        towns = {name: Town.load(name) for name in (cfg.town, cfg.test_town)}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
-    torch.manual_seed(cfg.seed)
     began = time.perf_counter()
 
-    agent = HierarchicalAgent(AgentConfig(**OmegaConf.to_container(cfg.model))).to(cfg.device)
     history = train(cfg, agent, CSVLogger("log", str(folder)))
     save_agent(agent, folder)
     plot_losses(history, folder / "losses.png")

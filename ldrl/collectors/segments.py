@@ -185,7 +185,8 @@ class BoundarySampler(Sampler):
         snippets = list(segment.snippets) if frame < boundary else list(segment.snippets[1:])
         decisions = [(frame, SubTask(int(self._snippets.subtask[snippets[0]])))]
         for k in snippets[1:]:
-            frame = int(self._snippets.start[k]) + self._random.randint(*BOUNDARY)
+            # Never before the decision before, nor behind the drive, however short a snippet is.
+            frame = max(frame, int(self._snippets.start[k]) + self._random.randint(*BOUNDARY))
             frame = min(frame, int(self._snippets.drive_end[k]) - 1)
             decisions.append((frame, SubTask(int(self._snippets.subtask[k]))))
         decisions[-1] = (decisions[-1][0], SubTask.FINISH)

@@ -20,7 +20,7 @@ from ldrl.towns import Town
 
 __all__ = ["MARGIN", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
 
-MARGIN = 10
+MARGIN = 20
 """Frames before and after a snippet that its slices may reach into."""
 NEAR_END = 0.5
 """Share of slices that show the end of their snippet: lane following is long, and its end would be rare."""

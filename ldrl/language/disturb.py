@@ -9,7 +9,23 @@ from ldrl.language.tokens import normalise
 
 __all__ = ["MEANINGFUL", "disturb"]
 
-MEANINGFUL = frozenset("left right straight first second next two twice both another again once one more times".split())
+MEANINGFUL = frozenset(
+    (
+        "left",
+        "right",
+        "straight",
+        "first",
+        "second",
+        "next",
+        "two",
+        "twice",
+        "times",
+        "both",
+        "another",
+        "again",
+        "more",
+    )
+)
 """Words that say which way and how often; they are never touched."""
 
 

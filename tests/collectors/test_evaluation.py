@@ -196,18 +196,18 @@ def test_the_number_of_cars_changes_nothing(sample, towns, outcomes, num_cars):
 
 
 def test_agents_do_not_depend_on_their_neighbours(untrained, sample, towns):
-    some = sample[1::2][:4]
+    some = sorted(sample, key=lambda episode: len(episode.path))[:3]
     together = evaluate(untrained, some, towns)
     alone = evaluate(untrained, some, towns, num_cars=1)
     for one, other in zip(together, alone, strict=True):
         assert one.episode == other.episode
-        torch.testing.assert_close(one.track[:20], other.track[:20], atol=1e-3, rtol=0)
-        assert torch.equal(one.subtasks[:20], other.subtasks[:20])
+        torch.testing.assert_close(one.track[:100], other.track[:100], atol=1e-3, rtol=0)
+        assert torch.equal(one.subtasks[:100], other.subtasks[:100])
 
 
 def test_random_driving_nearly_always_fails(untrained, episodes, towns):
-    some = episodes["town1"][::6] + episodes["town2"][::6]
-    for policy in (Dice(), untrained):
+    turns = [episode for episode in episodes["town2"] if episode.keyword in ("left", "right")]
+    for policy, some in ((Dice(), episodes["town1"][::6] + episodes["town2"][::6]), (untrained, turns[::4])):
         outcomes = evaluate(policy, some, towns)
         assert len(outcomes) == len(some)
         assert sum(outcome.success for outcome in outcomes) <= 0.15 * len(some)
@@ -216,7 +216,8 @@ def test_random_driving_nearly_always_fails(untrained, episodes, towns):
 
 
 def test_subtasks_are_the_agents(untrained, sample, towns):
-    outcome = evaluate(untrained, sample[:1], towns)[0]
+    shortest = min(sample, key=lambda episode: len(episode.path))
+    outcome = evaluate(untrained, [shortest], towns)[0]
     assert outcome.finished == bool((outcome.subtasks == SubTask.FINISH).any())
 
 
