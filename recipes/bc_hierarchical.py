@@ -154,7 +154,7 @@ def main(cfg: DictConfig) -> None:
         "Hardware": f"{platform.machine()}, {torch.get_num_threads()} threads, device {cfg.device}",
         "Versions": f"Python {platform.python_version()}, torch {torch.__version__}",
     }
-    report = to_markdown(outcomes, title=cfg.name, details=details)
+    report = to_markdown(outcomes, title=folder.name, details=details)
     with replacing(folder / "report.md") as file:
         file.write_text(report, encoding="utf-8")
     print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{cfg.town}.png.")

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ldrl.collectors import evaluate
-from ldrl.collectors.report import check_writable, table, write_json
+from ldrl.collectors.report import check_writable, keyword_table, table, write_json
 from ldrl.envs import builtin_episodes, load_episodes
 from ldrl.modules import load_agent
 from ldrl.towns import LAYOUTS, Town
@@ -26,21 +26,23 @@ from ldrl.towns import LAYOUTS, Town
 def main(cfg: DictConfig) -> None:
     """Check everything, then drive."""
     try:
-        agent = load_agent(cfg.checkpoint, cfg.device)
+        if cfg.num_cars < 1:
+            raise ValueError(f"num_cars is {cfg.num_cars}; give at least 1")
+        agent = load_agent(str(cfg.checkpoint), cfg.device)
         towns = {name: Town.load(name) for name in LAYOUTS}
         if cfg.episodes == "builtin":
             episodes = [episode for town in towns.values() for episode in builtin_episodes(town)]
         else:
-            episodes = load_episodes(cfg.episodes, towns)
+            episodes = load_episodes(str(cfg.episodes), towns)
         if cfg.out is not None:
-            check_writable(cfg.out)
-    except (OSError, ValueError) as error:
+            check_writable(str(cfg.out))
+    except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
         outcomes = evaluate(agent, episodes, towns, num_cars=cfg.num_cars, device=cfg.device, progress=bar.update)
-    print(table(outcomes))
+    print(f"{table(outcomes)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
-        write_json(outcomes, cfg.out)
+        write_json(outcomes, str(cfg.out))
         print(f"Every episode's outcome is in {cfg.out}.")
 
 

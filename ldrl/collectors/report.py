@@ -15,7 +15,7 @@ from typing import Any
 from ldrl.collectors.evaluation import FINISH_NEAR, NEAR, Outcome
 from ldrl.language import KEYWORDS
 
-__all__ = ["PAPER", "check_writable", "replacing", "summarise", "table", "to_json", "to_markdown", "write_json"]
+__all__ = ["PAPER", "check_writable", "keyword_table", "replacing", "summarise", "table", "to_json", "to_markdown", "write_json"]
 
 PAPER: dict[str, dict[str, float]] = {
     "town1": {"single": 1.000, "double": 1.000, "ordinal": 1.000, "all": 1.000},
@@ -160,7 +160,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return _markdown_table(rows, left=2)
 
 
-def _keyword_table(outcomes: Sequence[Outcome]) -> str:
+def keyword_table(outcomes: Sequence[Outcome]) -> str:
+    """Success and strict success of every keyword as a Markdown table, the towns side by side."""
     towns = summarise(outcomes)["towns"]
     rows = [("keyword", "type", *(f"{town} {name}" for town in towns for name in ("episodes", "success", "strict")))]
     for keyword in KEYWORDS.values():
@@ -189,7 +190,7 @@ def to_markdown(outcomes: Sequence[Outcome], *, title: str = "Report", details: 
         table(outcomes),
         "\n".join(NOTES),
         "## Per keyword",
-        _keyword_table(outcomes),
+        keyword_table(outcomes),
         f"## Episodes without strict success: {len(wrong)}",
         _wrong_table(wrong) if wrong else "None.",
     ]

@@ -145,7 +145,6 @@ class HierarchicalAgent(TensorDictModuleBase):
             memory[key] = spec
         return TensorDictPrimer(memory, expand_specs=True)
 
-    @torch.no_grad()
     def decide(self, tensordict: TensorDictBase) -> None:
         """Ask the high-level policy in the rows that switch."""
         switch = tensordict[keys.SWITCH]

@@ -1,0 +1,297 @@
+"""Both recipes, run as a user runs them, and every way in which their input can be bad."""
+
+import csv
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+
+from ldrl.envs import save_episodes
+from ldrl.language import KEYWORDS
+from ldrl.modules import AgentConfig, load_agent
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+TINY = ("model.conv_channels=[2,3,4]", "model.features=8", "model.low_level_hidden=6", "model.high_level_hidden=7")
+BRIEF = ("preset=smoke", "low_level_steps=2", "high_level_steps=2", "batch_slices=4", "batch_sequences=4")
+
+
+def start(recipe, *arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", str(RECIPES / recipe), *arguments],
+        cwd=cwd,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """Where ``bc_hierarchical.py`` has run, and what it printed."""
+    cwd = tmp_path_factory.mktemp("train")
+    done = start("bc_hierarchical.py", *BRIEF, *TINY, "name=brief", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return cwd, done
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Runs a recipe in this process; returns what it printed, and its error if it exits with one."""
+
+    def call(recipe, *arguments, cwd):
+        monkeypatch.chdir(cwd)
+        monkeypatch.setattr(sys, "argv", [str(RECIPES / recipe), *arguments])
+        error = None
+        try:
+            runpy.run_path(str(RECIPES / recipe), run_name="__main__")
+        except SystemExit as exit_:
+            error = exit_.code
+        finally:
+            GlobalHydra.instance().clear()
+        return capsys.readouterr().out, error
+
+    return call
+
+
+@pytest.fixture
+def some(episodes):
+    """A few short episodes of both towns, with odd ids."""
+    chosen = [sorted(episodes[name], key=lambda e: len(e.path))[k] for k in (0, 3) for name in ("town2", "town1")]
+    ids = ["b", "a|b\n🚗", "", "b"]
+    return [type(e)(**{**vars(e), "id": name}) for e, name in zip(chosen, ids, strict=True)]
+
+
+def test_everything_is_written(trained):
+    cwd, done = trained
+    folder = cwd / "runs" / "brief"
+    assert [path.name for path in cwd.iterdir()] == ["runs"]
+    assert {path.name for path in folder.iterdir()} == {
+        "agent.json",
+        "agent.safetensors",
+        "config.yaml",
+        "log",
+        "losses.png",
+        "report.json",
+        "report.md",
+        "tracks_town1.png",
+        "tracks_town2.png",
+    }
+    for picture in folder.glob("*.png"):
+        assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "runs/brief" in done.stdout
+    assert "strict success" in done.stdout
+    for stage in ("low level", "high level", "evaluation"):  # progress bars with the time left
+        assert re.search(rf"{stage}: 100%.*<", done.stderr)
+
+
+def test_the_checkpoint_is_the_config(trained):
+    cwd, _ = trained
+    agent = load_agent(cwd / "runs" / "brief")
+    config = yaml.safe_load((cwd / "runs" / "brief" / "config.yaml").read_text())
+    assert agent.config == AgentConfig(**config["model"])
+    assert agent.config.conv_channels == (2, 3, 4)
+    assert config["low_level_steps"] == 2
+
+
+def test_the_report_has_every_episode(trained, episodes):
+    cwd, _ = trained
+    report = json.loads((cwd / "runs" / "brief" / "report.json").read_text())
+    found = [(record["town"], record["keyword"]) for record in report["episodes"]]
+    assert found == [(town, keyword) for town in ("town1", "town2") for keyword in KEYWORDS]  # one of each
+    assert {record["id"] for record in report["episodes"]} <= {e.id for some in episodes.values() for e in some}
+    assert report["summary"]["episodes"] == 28
+    markdown = (cwd / "runs" / "brief" / "report.md").read_text()
+    assert markdown.startswith("# brief\n")
+    assert "paper" in markdown
+
+
+def test_losses_are_logged(trained):
+    cwd, _ = trained
+    logs = {path.stem: path for path in (cwd / "runs" / "brief" / "log").rglob("*.csv")}
+    assert {"loss_control", "loss_end_of_subtask", "loss_subtask"} <= set(logs)
+    for path in logs.values():
+        rows = list(csv.reader(path.open()))
+        assert [float(row[0]) for row in rows] == [0, 1]
+        assert all(float(row[1]) >= 0 for row in rows)
+    accuracies = [name for name in logs if "accuracy" in name]
+    assert len(accuracies) == 2  # of two networks, not mixed
+
+
+def test_evaluate_writes_its_json(trained, some, tmp_path):
+    cwd, _ = trained
+    save_episodes(some, tmp_path / "mine.jsonl")
+    done = start("evaluate.py", f"checkpoint={cwd}/runs/brief", "episodes=mine.jsonl", "out=mine.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.jsonl", "mine.json"}
+    result = json.loads((tmp_path / "mine.json").read_text())
+    assert set(result) == {"summary", "episodes"}
+    assert [record["id"] for record in result["episodes"]] == [episode.id for episode in some]
+    for record, episode in zip(result["episodes"], some, strict=True):
+        assert (record["town"], record["keyword"]) == (episode.town, episode.keyword)
+        assert record["instruction"] == episode.instruction
+        for flag in ("success", "strict_success", "collision", "off_road", "wrong_lane", "finished", "stuck"):
+            assert type(record[flag]) is bool, flag
+    assert result["summary"]["episodes"] == 4
+    assert {town: values["episodes"] for town, values in result["summary"]["towns"].items()} == {"town2": 2, "town1": 2}
+    assert "| town1 |" in done.stdout
+
+
+def test_evaluate_prints_without_writing(trained, some, tmp_path, call):
+    cwd, _ = trained
+    save_episodes(some[:1], tmp_path / "mine.jsonl")
+    printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", "episodes=mine.jsonl", cwd=tmp_path)
+    assert error in (None, 0)
+    assert "| town2 |" in printed
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.jsonl"]
+
+
+def test_odd_instructions_are_no_errors(trained, some, tmp_path, call):
+    cwd, _ = trained
+    odd = ["word " * 5000, "zzyzzyx qwrtz", "🚗 ⬅️", "Links abbiegen!"]
+    said = [type(e)(**{**vars(e), "instruction": text}) for e, text in zip(some, odd, strict=True)]
+    save_episodes(said, tmp_path / "odd.jsonl")
+    where = (f"checkpoint={cwd}/runs/brief", "episodes=odd.jsonl", "out=odd.json")
+    _, error = call("evaluate.py", *where, cwd=tmp_path)
+    assert error in (None, 0)
+    records = json.loads((tmp_path / "odd.json").read_text())["episodes"]
+    assert [record["instruction"] for record in records] == odd
+
+
+def broken(episode, **changes):
+    record = json.loads(json.dumps(vars(episode)))
+    record.update(changes)
+    return json.dumps({key: value for key, value in record.items() if value is not ...})
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (lambda e: broken(e)[:-5], "mine.jsonl, line 2: not JSON"),
+        (lambda e: broken(e, start=...), "mine.jsonl, line 2: start missing"),
+        (lambda e: broken(e, town="atlantis"), "mine.jsonl, line 2: unknown town 'atlantis'; use one of town1, town2"),
+        (lambda e: broken(e, keyword="third left"), "mine.jsonl, line 2: unknown keyword 'third left'"),
+        (lambda e: broken(e, path=[]), "mine.jsonl, line 2: path is []; give at least one point"),
+        (lambda e: broken(e, instruction=""), "mine.jsonl, line 2: the instruction '' has no word"),
+        (lambda e: broken(e, start=[9999, 9999, 0]), "from the nearest lane of 'town2'"),
+    ],
+)
+def test_broken_episode_files(trained, some, tmp_path, call, line, message):
+    cwd, _ = trained
+    (tmp_path / "mine.jsonl").write_text(f"{broken(some[0])}\n{line(some[0])}\n")
+    where = (f"checkpoint={cwd}/runs/brief", "episodes=mine.jsonl", "out=mine.json")
+    _, error = call("evaluate.py", *where, cwd=tmp_path)
+    assert error.startswith("error: ")
+    assert message in error
+    assert "\n" not in error
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.jsonl"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["checkpoint=atlantis"], "no checkpoint 'atlantis'; give a folder with"),
+        (["checkpoint=7"], "no checkpoint '7'"),
+        (["checkpoint=cut"], "agent.safetensors is no complete safetensors file"),
+        (["checkpoint=foreign"], "agent.json is no agent config"),
+        (["episodes=none.jsonl"], "there is no episode file 'none.jsonl'; give a JSON-lines file or 'builtin'"),
+        (["episodes=7"], "there is no episode file '7'"),
+        (["out=no/such/folder.json"], "cannot write 'no/such/folder.json'"),
+        (["out=cut"], "cannot write 'cut'"),
+        (["num_cars=0"], "num_cars is 0; give at least 1"),
+        (["device=moon"], "moon"),
+    ],
+)
+def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, message):
+    cwd, _ = trained
+    checkpoint = cwd / "runs" / "brief"
+    for name in ("cut", "foreign"):
+        (tmp_path / name).mkdir()
+        for file in ("agent.json", "agent.safetensors"):
+            (tmp_path / name / file).write_bytes((checkpoint / file).read_bytes())
+    (tmp_path / "cut" / "agent.safetensors").write_bytes((checkpoint / "agent.safetensors").read_bytes()[:999])
+    (tmp_path / "foreign" / "agent.json").write_text('{"model_type": "llama"}')
+    save_episodes(some, tmp_path / "mine.jsonl")
+    given = {"checkpoint": checkpoint, "episodes": "mine.jsonl", "out": "mine.json"}
+    given |= dict(argument.split("=") for argument in arguments)
+    _, error = call("evaluate.py", *(f"{key}={value}" for key, value in given.items()), cwd=tmp_path)
+    assert str(error).startswith("error: ")
+    assert message in error
+    assert "\n" not in error
+    assert {path.name for path in tmp_path.iterdir()} == {"cut", "foreign", "mine.jsonl"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["town=atlantis"], "'atlantis'"),
+        (["test_town=atlantis"], "'atlantis'"),
+        (["model.features=0"], "features is 0; give a whole number above 0"),
+        (["model.image_rows=10"], "rows is 10"),
+        (["device=moon"], "moon"),
+    ],
+)
+def test_bad_arguments_of_training(tmp_path, call, arguments, message):
+    _, error = call("bc_hierarchical.py", *BRIEF, *TINY, *arguments, cwd=tmp_path)
+    assert str(error).startswith("error: ")
+    assert message in error
+    assert "\n" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_unwritable_run_folder(tmp_path, call):
+    (tmp_path / "runs").write_text("a file where the folder should be")
+    _, error = call("bc_hierarchical.py", *BRIEF, *TINY, cwd=tmp_path)
+    assert str(error).startswith("error: ")
+    assert "runs" in error
+    assert (tmp_path / "runs").read_text() == "a file where the folder should be"
+
+
+def test_unknown_presets_are_named(tmp_path):
+    done = start("bc_hierarchical.py", "preset=atlantis", cwd=tmp_path)
+    assert done.returncode != 0
+    assert "preset/atlantis" in done.stderr
+    assert re.search(r"default\s+smoke", done.stderr)
+    assert not list(tmp_path.iterdir())
+
+
+def leaves(values):
+    for key, value in values.items():
+        if key not in ("defaults", "hydra"):
+            yield key
+
+
+@pytest.mark.parametrize("recipe", ["bc_hierarchical", "evaluate"])
+def test_every_config_key_is_read(recipe):
+    files = [RECIPES / "config" / f"{recipe}.yaml"]
+    if recipe == "bc_hierarchical":
+        files += (RECIPES / "config" / "preset").glob("*.yaml")
+    source = (RECIPES / f"{recipe}.py").read_text()
+    for title in re.findall(r'fit\(cfg, "(\w+)"', source):  # read as cfg[f"{title}_steps"]
+        source = source.replace('cfg[f"{title}_', f"cfg.{title}_steps cfg[f\"{{title}}_")
+    keys = {key for file in files for key in leaves(yaml.safe_load(file.read_text()))}
+    assert keys
+    unread = {key for key in keys if not re.search(rf"\bcfg\.{key}\b", source)}
+    assert not unread
+
+
+def test_presets_and_models_have_the_same_keys():
+    for group in ("preset", "model"):
+        files = sorted((RECIPES / "config" / group).glob("*.yaml"))
+        assert len(files) > 1
+        found = [set(leaves(yaml.safe_load(file.read_text()))) - {"name"} for file in files]
+        assert all(keys == found[0] for keys in found)
+
+
+def test_models_are_agent_configs():
+    models = {file.stem: yaml.safe_load(file.read_text()) for file in (RECIPES / "config" / "model").glob("*.yaml")}
+    assert AgentConfig(**models["small"]) == AgentConfig()
+    assert AgentConfig(**models["paper"]) == AgentConfig.paper()
