@@ -15,7 +15,17 @@ from typing import Any
 from ldrl.collectors.evaluation import FINISH_NEAR, NEAR, Outcome
 from ldrl.language import KEYWORDS
 
-__all__ = ["PAPER", "check_writable", "keyword_table", "replacing", "summarise", "table", "to_json", "to_markdown", "write_json"]
+__all__ = [
+    "PAPER",
+    "check_writable",
+    "keyword_table",
+    "replacing",
+    "summarise",
+    "table",
+    "to_json",
+    "to_markdown",
+    "write_json",
+]
 
 PAPER: dict[str, dict[str, float]] = {
     "town1": {"single": 1.000, "double": 1.000, "ordinal": 1.000, "all": 1.000},
