@@ -169,11 +169,14 @@ class HierarchicalAgent(TensorDictModuleBase):
             step under ``("next", "agent")``.
 
         Raises:
-            KeyError: the memory is missing: the env lacks :meth:`make_tensordict_primer`.
+            KeyError: an input or the memory is missing: the env lacks a transform, such as
+                :meth:`make_tensordict_primer`.
         """
-        missing = [key for key in self._memory if key not in tensordict.keys(True, True)]
+        missing = [key for key in self.in_keys if key not in tensordict.keys(True, True)]
         if missing:
-            raise KeyError(f"{missing[0]} is missing; append agent.make_tensordict_primer() to the env")
+            raise KeyError(
+                f"{missing[0]} is missing; give the env a DashCamera, an Instruction and agent.make_tensordict_primer()"
+            )
         if tensordict.batch_dims == 0:
             return tensordict.update(self(tensordict.unsqueeze(0)).squeeze(0))
         memory = tensordict.select(*self.in_keys)

@@ -265,7 +265,7 @@ def test_memory_is_declared_for_every_env(agent, town2):
 
 
 def test_without_its_memory_it_says_what_to_do(agent, observe, town2):
-    with pytest.raises(KeyError, match=r"is missing; append agent\.make_tensordict_primer\(\) to the env"):
+    with pytest.raises(KeyError, match=r"is missing; give the env .* agent\.make_tensordict_primer\(\)"):
         agent(observe(2, 0))
     with pytest.raises(KeyError, match="make_tensordict_primer"):
         make_env(town2, 2).rollout(2, agent)
