@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+from itertools import pairwise
 
 from torchrl.data.vla import schema
 
@@ -40,7 +41,7 @@ def test_every_key_is_documented():
     body = ast.parse(inspect.getsource(keys)).body
     documented = {
         before.targets[0].id
-        for before, after in zip(body, body[1:], strict=False)
+        for before, after in pairwise(body)
         if isinstance(before, ast.Assign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
     }
     assert set(CONSTANTS) - documented <= {"WORLD"}

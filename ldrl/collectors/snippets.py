@@ -18,10 +18,11 @@ from ldrl.envs.camera import shift
 from ldrl.subtasks import LOW_LEVEL
 from ldrl.towns import Town
 
-__all__ = ["MARGIN", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
+__all__ = ["MARGINS", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
 
-MARGIN = 20
-"""Frames before and after a snippet that its slices may reach into."""
+MARGINS = (10, 15)
+"""Frames before and behind a snippet that its slices may reach into. Lane following must not reach so far back into the
+junction before it, nor so far into the one behind it, that the two look alike."""
 NEAR_END = 0.5
 """Share of slices that show the end of their snippet: lane following is long, and its end would be rare."""
 
@@ -77,7 +78,7 @@ class SnippetSampler(Sampler):
     Args:
         buffer: demonstrations.
         slice_length: frames in a slice.
-        margin: frames before and after a snippet.
+        margins: frames before and behind a snippet.
         seed: of the sampler's own generator.
 
     Raises:
@@ -85,12 +86,12 @@ class SnippetSampler(Sampler):
     """
 
     def __init__(
-        self, buffer: TensorDictReplayBuffer, slice_length: int = 20, margin: int = MARGIN, seed: int = 0
+        self, buffer: TensorDictReplayBuffer, slice_length: int = 20, margins: tuple[int, int] = MARGINS, seed: int = 0
     ) -> None:
         stored = buffer.storage[:]
         snippets = cut_snippets(torch.as_tensor(stored[keys.SUBTASK]), torch.as_tensor(stored[TRAJECTORY]))
-        first = (snippets.start - margin).maximum(snippets.drive_start)
-        last = (snippets.end + margin).minimum(snippets.drive_end) - slice_length
+        first = (snippets.start - margins[0]).maximum(snippets.drive_start)
+        last = (snippets.end + margins[1]).minimum(snippets.drive_end) - slice_length
         fits = last >= first
         self.slice_length = slice_length
         self._generator = torch.Generator().manual_seed(seed)

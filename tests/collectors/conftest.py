@@ -23,9 +23,7 @@ def few(town2, tmp_path_factory):
 def labels(demonstrations):
     """Sub-task, drive and lane of every frame."""
     stored = demonstrations.storage[:]
-    return tuple(torch.as_tensor(stored[key]).clone() for key in (keys.SUBTASK, TRAJECTORY)) + (
-        stored[keys.ROUTE][:, 1].long(),
-    )
+    return stored[keys.SUBTASK].clone(), stored[TRAJECTORY].clone(), stored[keys.ROUTE][:, 1].long()
 
 
 @pytest.fixture

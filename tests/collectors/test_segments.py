@@ -1,5 +1,7 @@
 """Segments against the planner, and the decisions that are drawn from them."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from torchrl.data import TensorDictReplayBuffer
@@ -160,7 +162,7 @@ def test_decisions_follow_the_instruction(sampled):
         kinds.append(keyword)
         manoeuvres = [k for k in target if k not in (FOLLOW, FINISH)]
         # Lane following and manoeuvres by turns; the first decision may already be a manoeuvre.
-        assert all((a == FOLLOW) != (b == FOLLOW) for a, b in zip(target[:-1], target[1:-1], strict=False))
+        assert all((a == FOLLOW) != (b == FOLLOW) for a, b in pairwise(target[:-1]))
         assert target[-2] == manoeuvres[-1]
         if KEYWORDS[keyword].type == "ordinal":
             assert manoeuvres == [SubTask.STRAIGHT] * (len(manoeuvres) - 1) + [KEYWORDS[keyword].manoeuvres[0]]

@@ -125,6 +125,8 @@ def test_recurrent_states_start_anew_at_a_switch(restless, drive):
     switched = done[keys.SWITCH]
     assert switched[:, 1:].any()
     assert not switched.all()
+    assert not done["next", *keys.VOTES][switched][:, :-1].any()
+    assert done["next", *keys.VOTES][switched][:, -1].any()
     for row in range(5):
         for step in switched[row].nonzero().flatten().tolist():
             fresh = done[row : row + 1, step].exclude("next")
@@ -253,7 +255,6 @@ def test_runs_under_a_collector(restless, town2, steps):
     for key in restless._memory:
         if key != keys.AGENT_SUBTASK:  # the one that the agent also writes at the root
             assert not drives[key][:, starts].any(), key
-    assert torch.equal(drives[keys.AGE], (drives[keys.AGE]) * ~starts)
     assert drives[keys.SWITCH][:, starts].all()
     assert drives[restless.control.state_key][:, ~starts].any()
 

@@ -267,9 +267,7 @@ def test_unknown_presets_are_named(tmp_path, call):
 
 
 def leaves(values):
-    for key, value in values.items():
-        if key not in ("defaults", "hydra"):
-            yield key
+    return (key for key in values if key not in ("defaults", "hydra"))
 
 
 @pytest.mark.parametrize("recipe", ["bc_hierarchical", "evaluate"])
