@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from ldrl import keys
 from ldrl.envs.camera import DashCamera
@@ -51,5 +51,5 @@ def make_env(
     if policy is None or keys.IMAGE in policy.in_keys:
         transforms.append(DashCamera(town).to(device))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
-        transforms.append(policy.make_tensordict_primer())
+        transforms += [InitTracker(), policy.make_tensordict_primer()]
     return TransformedEnv(env, Compose(*transforms))

@@ -17,7 +17,7 @@ LENGTH, MARGIN, EACH = 15, 6, 40
 
 @pytest.fixture
 def sampled(demonstrations):
-    sampler = SnippetSampler(demonstrations, LENGTH, MARGIN)
+    sampler = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN))
     index, info = sampler.sample(demonstrations.storage, EACH * 4 * LENGTH)
     return index.view(-1, LENGTH), {key: value.view(-1, LENGTH) for key, value in info.items()}
 
@@ -74,7 +74,9 @@ def test_slices_are_balanced_and_show_ends(sampled):
 def test_every_snippet_that_fits_is_drawn(demonstrations, labels):
     subtask, drive, _ = labels
     snippets = cut_snippets(subtask, drive)
-    index, info = SnippetSampler(demonstrations, LENGTH, MARGIN).sample(demonstrations.storage, 600 * 4 * LENGTH)
+    index, info = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)).sample(
+        demonstrations.storage, 600 * 4 * LENGTH
+    )
     left = index.view(-1, LENGTH)[info[keys.SUBTASK].view(-1, LENGTH)[:, 0] == 0]
     lengths = (snippets.end + MARGIN).minimum(snippets.drive_end) - (snippets.start - MARGIN).maximum(
         snippets.drive_start
@@ -88,7 +90,7 @@ def test_a_buffer_writes_what_the_sampler_says(demonstrations):
     def sample(seed):
         return TensorDictReplayBuffer(
             storage=demonstrations.storage,
-            sampler=SnippetSampler(demonstrations, LENGTH, MARGIN, seed=seed),
+            sampler=SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN), seed=seed),
             batch_size=4 * LENGTH,
         ).sample()
 
@@ -96,7 +98,7 @@ def test_a_buffer_writes_what_the_sampler_says(demonstrations):
     assert first.shape == (4 * LENGTH,)
     assert torch.equal(first[keys.POSE], again[keys.POSE])
     assert not torch.equal(first[keys.POSE], other[keys.POSE])
-    index, info = SnippetSampler(demonstrations, LENGTH, MARGIN).sample(demonstrations.storage, 4 * LENGTH)
+    index, info = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)).sample(demonstrations.storage, 4 * LENGTH)
     assert torch.equal(first[keys.POSE], demonstrations.storage[:][keys.POSE][index])
     for key, value in info.items():
         assert torch.equal(first[key], value)
@@ -104,21 +106,21 @@ def test_a_buffer_writes_what_the_sampler_says(demonstrations):
 
 @pytest.mark.usefixtures("global_rng")
 def test_state_goes_on_where_it_was(demonstrations, tmp_path):
-    sampler = SnippetSampler(demonstrations, LENGTH, MARGIN)
+    sampler = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN))
     sampler.sample(demonstrations.storage, 4 * LENGTH)
     sampler.dumps(tmp_path / "state")
     expected, _ = sampler.sample(demonstrations.storage, 4 * LENGTH)
-    fresh = SnippetSampler(demonstrations, LENGTH, MARGIN, seed=5)
+    fresh = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN), seed=5)
     fresh.loads(tmp_path / "state")
     assert torch.equal(fresh.sample(demonstrations.storage, 4 * LENGTH)[0], expected)
 
 
 def test_errors_say_what_to_do(demonstrations, few):
-    sampler = SnippetSampler(demonstrations, LENGTH, MARGIN)
+    sampler = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN))
     with pytest.raises(ValueError, match=rf"batch of 100 frames .* slices of {LENGTH} .*multiple of {4 * LENGTH}"):
         sampler.sample(demonstrations.storage, 100)
     with pytest.raises(ValueError, match=rf"no \w+ snippet of {LENGTH} frames in 60 frames; collect more"):
-        SnippetSampler(few, LENGTH, MARGIN)
+        SnippetSampler(few, LENGTH, (MARGIN, MARGIN))
 
 
 @pytest.fixture
@@ -173,7 +175,7 @@ def test_views_are_seeded_and_leave_the_storage_alone(town2, demonstrations):
     def sample(seed):
         return TensorDictReplayBuffer(
             storage=demonstrations.storage,
-            sampler=SnippetSampler(demonstrations, LENGTH, MARGIN),
+            sampler=SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)),
             batch_size=4 * LENGTH,
             transform=DisturbedView(town2, LENGTH, seed=seed),
         ).sample()
@@ -187,7 +189,7 @@ def test_views_are_seeded_and_leave_the_storage_alone(town2, demonstrations):
 def test_the_camera_behind_it_draws_the_moved_view(town2, demonstrations):
     buffer = TensorDictReplayBuffer(
         storage=demonstrations.storage,
-        sampler=SnippetSampler(demonstrations, LENGTH, MARGIN),
+        sampler=SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)),
         batch_size=4 * LENGTH,
         transform=DisturbedView(town2, LENGTH, lateral=0.8, yaw=math.radians(14)),
     )
