@@ -11,6 +11,7 @@ Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of 
 from __future__ import annotations
 
 import platform
+import shutil
 import sys
 import time
 from collections import defaultdict
@@ -47,7 +48,7 @@ def fit(
     rows: int,
     logger: CSVLogger,
 ) -> History:
-    """Minimise losses together over ``cfg[title].steps`` batches of ``rows`` sequences."""
+    """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences."""
     parameters = [parameter for loss in losses for parameter in loss.parameters()]
     steps = cfg[f"{title}_steps"]
     optimizer = torch.optim.Adam(parameters)
@@ -83,10 +84,14 @@ def view(cfg: DictConfig, storage: Storage, sampler: Sampler, batch_size: int, d
     )
 
 
-def train(cfg: DictConfig, agent: HierarchicalAgent, logger: CSVLogger) -> History:
+def train(cfg: DictConfig, agent: HierarchicalAgent, folder: Path) -> History:
     """Collect demonstrations and train the three networks."""
     town = Town.load(cfg.town)
-    demonstrations = collect_demonstrations(town, cfg.demonstration_frames, seed=cfg.seed)
+    shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
+    logger = CSVLogger("log", str(folder))
+    demonstrations = collect_demonstrations(
+        town, cfg.demonstration_frames, path=folder / "demonstrations", seed=cfg.seed
+    )
     slices = view(
         cfg,
         demonstrations.storage,
@@ -134,9 +139,9 @@ def main(cfg: DictConfig) -> None:
         sys.exit(f"error: {error}")
     began = time.perf_counter()
 
-    history = train(cfg, agent, CSVLogger("log", str(folder)))
+    history = train(cfg, agent, folder)
     save_agent(agent, folder)
-    plot_losses(history, folder / "losses.png")
+    plot_losses({name: losses for name, losses in history.items() if name.startswith("loss_")}, folder / "losses.png")
     trained = time.perf_counter()
 
     episodes = choose_episodes(cfg, towns)

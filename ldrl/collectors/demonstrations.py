@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import torch
@@ -81,7 +80,7 @@ def collect_demonstrations(
         town: where to drive.
         frames: how many frames, a multiple of ``num_cars``.
         num_cars: cars that drive side by side; each drives ``frames / num_cars`` frames.
-        path: folder of the memory-mapped storage; None for a temporary one.
+        path: folder of the memory-mapped storage; None for temporary files.
         noise: scale of :class:`SteeringNoise`.
         seed: of cars and noise.
 
@@ -101,9 +100,11 @@ def collect_demonstrations(
     steps = frames // num_cars
     env = TransformedEnv(TownEnv(town, num_cars, max_steps=steps, seed=seed), SubtaskLabels(town))
     policy = TensorDictSequential(Expert(town), SteeringNoise(noise, seed=seed))
-    folder = Path(path) if path is not None else Path(tempfile.mkdtemp(prefix="ldrl-demonstrations-"))
-    buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(frames, scratch_dir=str(folder), existsok=True))
-    collector = Collector(env, policy, frames_per_batch=frames, total_frames=frames)
+    folder = None if path is None else str(path)
+    buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(frames, scratch_dir=folder, existsok=True))
+    collector = Collector(
+        env, policy, frames_per_batch=frames, total_frames=frames, auto_register_policy_transforms=False
+    )
     try:
         for drives in collector:
             buffer.extend(drives.select(*STORED).reshape(-1))
