@@ -21,9 +21,9 @@ from ldrl.towns import Town
 
 __all__ = ["BoundarySampler", "Segment", "find_segments"]
 
-START = (-70, 11)
-"""Frames around the begin of the first manoeuvre in which most instructions are given: from 39 m before it to its
-junction's entry."""
+START = (-70, 16)
+"""Frames around the begin of the first manoeuvre in which most instructions are given: from 39 m before it to 3 m into
+its junction."""
 ANYWHERE = 0.25
 """Share of instructions given anywhere on the way to the first manoeuvre."""
 BOUNDARY = (-4, 8)

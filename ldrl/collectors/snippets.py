@@ -86,7 +86,7 @@ class SnippetSampler(Sampler):
     """
 
     def __init__(
-        self, buffer: TensorDictReplayBuffer, slice_length: int = 20, margins: tuple[int, int] = MARGINS, seed: int = 0
+        self, buffer: TensorDictReplayBuffer, slice_length: int = 40, margins: tuple[int, int] = MARGINS, seed: int = 0
     ) -> None:
         stored = buffer.storage[:]
         snippets = cut_snippets(torch.as_tensor(stored[keys.SUBTASK]), torch.as_tensor(stored[TRAJECTORY]))
