@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from ldrl import keys
-from ldrl.collectors.expert import CRUISE_SPEED, Expert, expert_action
+from ldrl.collectors.expert import Expert, expert_action
 from ldrl.envs import TownEnv
 from ldrl.envs.camera import shift
+from ldrl.envs.vehicle import CRUISE_SPEED
 
 FLAGS = (keys.OFF_ROAD, keys.WRONG_LANE, keys.COLLISION)
 
