@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ldrl import keys
-from ldrl.collectors.expert import Expert, expert_action
+from ldrl.collectors.expert import LOOK_AHEAD, Expert, expert_action
 from ldrl.envs import TownEnv
 from ldrl.envs.camera import shift
 from ldrl.envs.vehicle import CRUISE_SPEED
@@ -58,7 +58,7 @@ def test_returns_to_its_lane(town2, lateral, yaw):
     position = td[keys.ROUTE_POSITION].squeeze(-1)
     steer = expert_action(town2, pose, td[keys.SPEED].squeeze(-1), td[keys.ROUTE], position)[:, 1]
     straight = expert_action(town2, td[keys.POSE], td[keys.SPEED].squeeze(-1), td[keys.ROUTE], position)[:, 1]
-    assert (torch.sign(steer - straight) == -torch.sign(torch.tensor(lateral + 3.5 * yaw))).all()
+    assert (torch.sign(steer - straight) == -torch.sign(torch.tensor(lateral + LOOK_AHEAD * yaw))).all()
     env._state[:, :3] = pose.double()
     td = env._observe()
     for _ in range(40):

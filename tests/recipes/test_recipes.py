@@ -81,6 +81,7 @@ def test_everything_is_written(trained):
         "agent.json",
         "agent.safetensors",
         "config.yaml",
+        "demonstrations",
         "log",
         "losses.png",
         "report.json",
