@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers import Sampler, Storage
+from torchrl.data.replay_buffers import Storage
 
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
-from ldrl.collectors.snippets import Snippets, cut_snippets
+from ldrl.collectors.snippets import DemonstrationSampler, Snippets, cut_snippets
 from ldrl.language import KEYWORDS, MEANINGFUL, Sentences, Split, Tokenizer, disturb, realised_by
 from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
@@ -89,7 +89,7 @@ def _options(town: Town) -> list[frozenset[SubTask]]:
     return [frozenset(SubTask(int(town.lane_manoeuvre[k])) for k in town.successors(p)) for p in before]
 
 
-class BoundarySampler(Sampler):
+class BoundarySampler(DemonstrationSampler):
     """Draws sequences of high-level decisions at the boundaries between sub-tasks, as many of each keyword.
 
     The first decision is where the instruction is given; each later one falls around the end of the sub-task before;
@@ -192,9 +192,6 @@ class BoundarySampler(Sampler):
         decisions[-1] = (decisions[-1][0], SubTask.FINISH)
         return decisions
 
-    def _empty(self) -> None:
-        raise RuntimeError("a BoundarySampler is bound to the demonstrations that it was made from; make a new one")
-
     def state_dict(self) -> dict[str, Any]:
         """The generator's state."""
         return {"random": self._random.getstate()}
@@ -202,11 +199,3 @@ class BoundarySampler(Sampler):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the generator's state."""
         self._random.setstate(state_dict["random"])
-
-    def dumps(self, path: Any) -> None:
-        """Save the state to a file."""
-        torch.save(self.state_dict(), path)
-
-    def loads(self, path: Any) -> None:
-        """Load the state from a file."""
-        self.load_state_dict(torch.load(path, weights_only=False))

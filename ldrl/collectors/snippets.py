@@ -18,7 +18,7 @@ from ldrl.envs.camera import shift
 from ldrl.subtasks import LOW_LEVEL
 from ldrl.towns import Town
 
-__all__ = ["MARGINS", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
+__all__ = ["MARGINS", "DemonstrationSampler", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
 
 MARGINS = (10, 15)
 """Frames before and behind a snippet that its slices may reach into. Lane following must not reach so far back into the
@@ -68,7 +68,27 @@ def cut_snippets(subtask: Tensor, drive: Tensor) -> Snippets:
     return Snippets(subtask[start], start, end, drive_start[which], drive_end[which])
 
 
-class SnippetSampler(Sampler):
+class DemonstrationSampler(Sampler):
+    """A sampler that knows its demonstrations by heart, so it serves no other buffer.
+
+    A subclass gives ``sample``, ``state_dict`` and ``load_state_dict``.
+    """
+
+    def _empty(self) -> None:
+        raise RuntimeError(
+            f"a {type(self).__name__} is bound to the demonstrations that it was made from; make a new one"
+        )
+
+    def dumps(self, path: Any) -> None:
+        """Save the state to a file."""
+        torch.save(self.state_dict(), path)
+
+    def loads(self, path: Any) -> None:
+        """Load the state from a file."""
+        self.load_state_dict(torch.load(path))
+
+
+class SnippetSampler(DemonstrationSampler):
     """Draws slices of fixed length within snippets and their margins, as many of each sub-task.
 
     The batch size of the buffer counts frames, as with :class:`torchrl.data.SliceSampler`. Each frame gets the
@@ -135,9 +155,6 @@ class SnippetSampler(Sampler):
         info = {keys.SUBTASK: torch.cat(told).flatten(), keys.END_OF_SUBTASK: torch.cat(ended).flatten()}
         return torch.cat(index).flatten(), info
 
-    def _empty(self) -> None:
-        raise RuntimeError("a SnippetSampler is bound to the demonstrations that it was made from; make a new one")
-
     def state_dict(self) -> dict[str, Any]:
         """The generator's state."""
         return {"generator": self._generator.get_state()}
@@ -145,14 +162,6 @@ class SnippetSampler(Sampler):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the generator's state."""
         self._generator.set_state(state_dict["generator"])
-
-    def dumps(self, path: Any) -> None:
-        """Save the state to a file."""
-        torch.save(self.state_dict(), path)
-
-    def loads(self, path: Any) -> None:
-        """Load the state from a file."""
-        self.load_state_dict(torch.load(path))
 
 
 class DisturbedView(Transform):
