@@ -35,6 +35,7 @@ __all__ = [
     "SUBTASK",
     "SUBTASK_LOGITS",
     "SWITCH",
+    "TRAFFIC",
     "VOTES",
     "WORLD",
     "WRONG_LANE",
@@ -74,6 +75,9 @@ WRONG_LANE = (WORLD, "wrong_lane")
 """Whether two corners of the footprint are in an oncoming lane outside junctions, ``[*B, 1]`` bool."""
 COLLISION = (WORLD, "collision")
 """Whether the footprint touches a building, 4 m beyond the road's edge, ``[*B, 1]`` bool."""
+TRAFFIC = (WORLD, "traffic")
+"""x, y (m), heading (rad) and speed (m/s) of the other cars of the same world, ``[*B, N, 4]`` float32; rows of NaN hold
+no car. There is none without traffic."""
 
 AGENT = "agent"
 """The agent's own keys; it reads the root's and writes those of the next step."""
