@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -14,7 +14,7 @@ __all__ = ["CELL", "MARGIN", "Surface", "rasterise", "sample"]
 CELL = 0.5
 """Edge of a raster cell, m."""
 MARGIN = 8.0
-"""How far the rasters reach beyond the edge of the road, and the largest distance they tell, m."""
+"""How far a town's rasters reach beyond the edge of the road, and the largest distance they tell, m."""
 
 
 class Surface(NamedTuple):
@@ -23,8 +23,8 @@ class Surface(NamedTuple):
     Attributes:
         origin: ``[2]`` float32, x and y of the first cell's centre, m.
         road_distance: ``[1, 1, H, W]`` float32, signed distance to the edge of the road, negative on it, at most
-            ``MARGIN``, m.
-        nearest_point: ``[H, W]`` int64, index of the nearest centre-line point.
+            the margin, m.
+        nearest_point: ``[H, W]`` int64, index of the nearest centre-line point; 0 where none is in reach.
     """
 
     origin: Tensor
@@ -32,42 +32,38 @@ class Surface(NamedTuple):
     nearest_point: Tensor
 
 
-def rasterise(points: Tensor, headings: Tensor, half_width: float, spacing: float) -> Surface:
+def rasterise(
+    points: Tensor, headings: Tensor, half_width: Tensor | float, spacing: float, margin: float = MARGIN
+) -> Surface:
     """Rasterise the union of bands around centre lines.
 
     Args:
         points: ``[P, 2]`` float32, samples of all centre lines, m.
         headings: ``[P]`` float32, directions of the centre lines there, rad.
-        half_width: half the width of a band, m.
+        half_width: half the width of the band, a number or ``[P]`` float32, m.
         spacing: largest distance between neighbouring samples, m.
+        margin: how far the rasters reach beyond the bands, m.
 
     Returns:
-        The rasters. Each cell looks at the straight pieces through the samples within reach, so the distance is
-        exact to the curvature within half a spacing.
+        The rasters. Each cell looks at the straight piece through the sample next to it, so the distance is exact to
+        the curvature within half a spacing.
     """
-    border = half_width + MARGIN
+    half_width = torch.as_tensor(half_width, dtype=torch.float32).expand(len(points))
+    border = float(half_width.max()) + margin
     origin = points.amin(0) - border
     width, height = ((points.amax(0) + border - origin) / CELL).ceil().int().add(1).tolist()
-    reach = math.ceil(border / CELL)
-    steps = torch.arange(-reach, reach + 1)
-    window = torch.cartesian_prod(steps, steps).flip(-1)
-    distance = torch.full((height * width,), border)
-    nearest = torch.zeros(height * width, dtype=torch.long)
-    tangents = torch.stack((headings.cos(), headings.sin()), -1)
-    for rows in torch.arange(len(points)).split(256):
-        cells = ((points[rows] - origin) / CELL).round().int()[:, None] + window
-        offset = cells * CELL + origin - points[rows][:, None]
-        tangent = tangents[rows][:, None]
-        along = (offset * tangent).sum(-1, keepdim=True).clamp(-spacing / 2, spacing / 2)
-        value = (offset - along * tangent).norm(dim=-1)
-        inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
-        index = (cells[..., 1] * width + cells[..., 0])[inside].long()
-        value, source = value[inside], rows[:, None].expand_as(value)[inside]
-        distance.scatter_reduce_(0, index, value, "amin")
-        closest = value == distance[index]
-        nearest[index[closest]] = source[closest]
-    road_distance = (distance - half_width).clamp(max=MARGIN)
-    return Surface(origin, road_distance.view(1, 1, height, width), nearest.view(height, width))
+    grid = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    cells = torch.stack(grid[::-1], -1).view(-1, 2) * CELL + origin
+    _, found = cKDTree(points.numpy()).query(cells.numpy(), distance_upper_bound=border + spacing)
+    nearest = torch.from_numpy(found)
+    out_of_reach = nearest == len(points)
+    nearest[out_of_reach] = 0
+    offset, heading = cells - points[nearest], headings[nearest]
+    tangent = torch.stack((heading.cos(), heading.sin()), -1)
+    along = (offset * tangent).sum(-1, keepdim=True).clamp(-spacing / 2, spacing / 2)
+    distance = (offset - along * tangent).norm(dim=-1) - half_width[nearest]
+    distance = distance.masked_fill(out_of_reach, margin).clamp(max=margin)
+    return Surface(origin, distance.view(1, 1, height, width), nearest.view(height, width))
 
 
 def sample(raster: Tensor, origin: Tensor, positions: Tensor, mode: str = "bilinear") -> Tensor:
