@@ -15,6 +15,7 @@ __all__ = [
     "AGENT",
     "AGENT_FINISH",
     "AGENT_SUBTASK",
+    "APPEARANCE",
     "COLLISION",
     "CROSS_TRACK_ERROR",
     "END_LOGIT",
@@ -78,6 +79,8 @@ COLLISION = (WORLD, "collision")
 TRAFFIC = (WORLD, "traffic")
 """x, y (m), heading (rad) and speed (m/s) of the other cars of the same world, ``[*B, N, 4]`` float32; rows of NaN hold
 no car. There is none without traffic."""
+APPEARANCE = (WORLD, "appearance")
+"""Number of the episode's appearance, ``[*B, 1]`` int64; only where the dash camera draws one for each episode."""
 
 AGENT = "agent"
 """The agent's own keys; it reads the root's and writes those of the next step."""

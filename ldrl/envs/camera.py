@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import math
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn.functional import grid_sample
-from torchrl.data import Bounded, TensorSpec
+from torchrl.data import Bounded, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from ldrl import keys
+from ldrl.envs.appearance import WEATHERS, Look, appearance_number, looks
+from ldrl.envs.painting import paint
+from ldrl.envs.sight import HEIGHT, HORIZON, STEMS_IN_SIGHT, WIDTH, Mount, Sight
 from ldrl.towns import Town
-from ldrl.towns.surface import CELL
+from ldrl.towns.scenery import Material
 
-__all__ = ["HEIGHT", "WIDTH", "DashCamera", "shift"]
+__all__ = ["DashCamera", "shift"]
 
-HEIGHT, WIDTH = 88, 200
-FIELD_OF_VIEW = math.radians(90)
-FORWARD, ABOVE = 1.6, 1.7
-"""Mount: ahead of the vehicle's origin, and above the road, m."""
-FRAMES_AT_ONCE = 64
+CHANNELS = {"gs": 1, "rgb": 3}
+"""Channels of the image in each modality."""
+FRAMES_AT_ONCE = 32
 """Frames drawn together: few enough that their rays stay in the processor's cache."""
 
 
@@ -48,83 +48,132 @@ class DashCamera(Transform):
     """Draws the 88x200 image of a forward camera from ``("world", "pose")``, the whole batch at once.
 
     The same transform serves an env (draw now) and a replay buffer (draw when sampled). The camera stands 1.6 m ahead
-    of the vehicle's origin and 1.7 m above a flat road, has no pitch, and sees 90 degrees across. The modality is
-    ``gs``, a binary segmentation: 255 where the ray through the pixel's centre meets the drivable surface.
+    of the vehicle's origin and 1.7 m above a flat road, has no pitch, and sees 90 degrees across. Buildings, trees,
+    posts and the other cars of ``("world", "traffic")``, if there are any, hide what is behind them.
 
     Args:
         town: what there is to see.
+        modality: ``"gs"``, a binary segmentation, one channel: 255 where the ray through the pixel's centre meets the
+            drivable surface first; or ``"rgb"``.
+        appearance: of rgb images. One of ``WEATHERS``: the town's own materials in that weather. A number: other
+            materials and weather, the same for the same number. ``"episode"``: a new number at each reset, kept in
+            ``("world", "appearance")``. ``"sample"``: a new number for each image.
         lateral: offset of the mount to the right, m.
         yaw: turn of the mount to the right, rad.
+        seed: of the numbers drawn.
+
+    Raises:
+        ValueError: an unknown modality or appearance.
 
     Examples:
         >>> camera = DashCamera(Town.load("town1"))
         >>> camera.draw(torch.tensor([[200.0, 2.0, 3.14]])).shape
         torch.Size([1, 1, 88, 200])
+        >>> DashCamera(Town.load("town2"), modality="rgb", appearance="sunset").draw(torch.zeros(5, 3)).shape
+        torch.Size([5, 3, 88, 200])
     """
 
-    rays: Tensor
-
-    def __init__(self, town: Town, *, lateral: float = 0.0, yaw: float = 0.0) -> None:
+    def __init__(
+        self,
+        town: Town,
+        *,
+        modality: Literal["gs", "rgb"] = "gs",
+        appearance: str | int = "clear",
+        lateral: float = 0.0,
+        yaw: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        if modality not in CHANNELS:
+            raise ValueError(f"modality {modality!r} is unknown; use one of {', '.join(CHANNELS)}")
         super().__init__(in_keys=[keys.POSE], out_keys=[keys.IMAGE])
-        self.town = town
+        self.scenery = town.scenery
+        self.sight = Sight()
+        self.modality = modality
+        self.appearance = appearance
         self.lateral = lateral
         self.yaw = yaw
-        self.register_buffer("rays", ground_rays(), persistent=False)
+        self._generator = torch.Generator().manual_seed(seed)
+        if isinstance(appearance, str):
+            drawn = appearance in ("episode", "sample")
+            number = 0 if drawn else appearance_number(self.scenery.seed, appearance)
+        elif appearance >= 0:
+            number = appearance
+        else:
+            raise ValueError(f"appearance {appearance} is negative; use a number from 0 on or one of {WEATHERS}")
+        self.register_buffer("number", torch.tensor([number]), persistent=False)
+        self._numbers = torch.zeros(0, dtype=torch.long)
 
-    def draw(self, pose: Tensor) -> Tensor:
+    def draw(self, pose: Tensor, traffic: Tensor | None = None, number: Tensor | None = None) -> Tensor:
         """Draw images.
 
         Args:
             pose: of the vehicle's origin, ``[*B, 3]`` float32: x, y (m), heading (rad).
+            traffic: other cars, ``[*B, N, 4]`` float32: x, y (m), heading (rad), speed (m/s).
+            number: appearances, ``[*B]`` int64; None draws or takes what the camera was made with.
 
         Returns:
-            ``[*B, 1, 88, 200]`` uint8, 0 or 255.
+            ``[*B, C, 88, 200]`` uint8; ``gs``: 0 or 255.
         """
-        pose = shift(pose, self.lateral, self.yaw)
-        images = pose.new_zeros((pose[..., 0].numel(), 1, HEIGHT, WIDTH), dtype=torch.uint8)
-        below_horizon = images[:, :, HEIGHT // 2 :]
-        chunks = pose.reshape(-1, 3).split(FRAMES_AT_ONCE)
-        for chunk, target in zip(chunks, below_horizon.split(FRAMES_AT_ONCE), strict=True):
-            target.copy_(self._on_road(chunk))
-        return images.mul_(255).view(*pose.shape[:-1], 1, HEIGHT, WIDTH)
+        batch = pose.shape[:-1]
+        pose = shift(pose, self.lateral, self.yaw).reshape(-1, 3)
+        traffic = None if traffic is None else traffic.reshape(len(pose), -1, 4)
+        look = self._look(len(pose), number) if self.modality == "rgb" else None
+        images = pose.new_zeros((len(pose), CHANNELS[self.modality], HEIGHT, WIDTH), dtype=torch.uint8)
+        for first in range(0, len(pose), FRAMES_AT_ONCE):
+            rows = slice(first, first + FRAMES_AT_ONCE)
+            mount, others = Mount.on(pose[rows]), None if traffic is None else traffic[rows]
+            if look is None:
+                images[rows, 0, HORIZON:] = self._road(mount, others)
+            else:
+                images[rows] = paint(self.sight, self.scenery, mount, look.rows(rows), others)
+        if look is None:
+            images *= 255
+        return images.view(*batch, *images.shape[1:])
 
-    def _on_road(self, pose: Tensor) -> Tensor:
-        """Whether the rays below the horizon meet the road: ``[N, 1, 44, 200]`` bool."""
-        raster = self.town.road_distance.expand(len(pose), -1, -1, -1)
-        height, width = raster.shape[-2:]
-        cos, sin = pose[:, 2].cos(), pose[:, 2].sin()
-        # A ray (forward, right, 1) times this matrix is the raster coordinate that grid_sample reads, in [-1, 1].
-        axes = torch.stack((cos, sin, -sin, cos), -1).view(-1, 2, 2)
-        matrix = torch.cat((axes, (pose[:, :2] - self.town.raster_origin).unsqueeze(1)), 1)
-        matrix = matrix * (2 / CELL / matrix.new_tensor([width - 1, height - 1]))
-        grid = self.rays @ matrix
-        grid = grid.sub_(1).view(-1, HEIGHT // 2, WIDTH, 2)
-        return grid_sample(raster, grid, padding_mode="border", align_corners=True) < 0
+    def _look(self, count: int, number: Tensor | None) -> Look:
+        """How things look in each image, or in all of them."""
+        if number is None and self.appearance == "sample":
+            number = self._draw_numbers(count)
+        return looks(self.number if number is None else number.reshape(-1))
 
-    def _apply_transform(self, pose: Tensor) -> Tensor:
-        return self.draw(pose)
+    def _draw_numbers(self, count: int) -> Tensor:
+        return torch.randint(1 << 40, (count,), generator=self._generator).to(self.number.device)
+
+    def _road(self, mount: Mount, traffic: Tensor | None) -> Tensor:
+        """Whether the rays below the horizon meet the road first: ``[N, 44, 200]`` bool."""
+        ground, wall = self.sight.ground(self.scenery, mount)
+        props = self.sight.props(self.scenery, mount, STEMS_IN_SIGHT)
+        nearest, _ = self.sight.obstacle(self.scenery, props, wall)
+        road = (ground <= Material.STOP_LINE).logical_and_(self.sight.sees_ground(nearest))
+        if traffic is not None:
+            road &= ~self.sight.covers(self.sight.cars(mount, traffic), nearest).any(1)
+        return road
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self.appearance == "episode" and keys.APPEARANCE not in next_tensordict.keys(True):
+            next_tensordict[keys.APPEARANCE] = self._numbers.view(*next_tensordict.batch_size, 1)
+        number = next_tensordict.get(keys.APPEARANCE, None)
+        image = self.draw(next_tensordict[keys.POSE], next_tensordict.get(keys.TRAFFIC, None), number)
+        return next_tensordict.set(keys.IMAGE, image)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Draw the images of a batch from a replay buffer."""
+        return self._call(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self.appearance == "episode":
+            cars, reset = tensordict_reset.numel(), tensordict.get("_reset", None)
+            drawn = self._draw_numbers(cars).to(tensordict_reset.device)
+            if reset is not None and len(self._numbers) == cars:
+                drawn = torch.where(reset.view(-1), drawn, self._numbers)
+            self._numbers = drawn
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the image."""
-        shape = (*observation_spec.shape, 1, HEIGHT, WIDTH)
-        observation_spec[keys.IMAGE] = Bounded(0, 255, shape, observation_spec.device, torch.uint8)
+        """Add the image, and the appearance where it belongs to the episode."""
+        batch, device = observation_spec.shape, observation_spec.device
+        shape = (*batch, CHANNELS[self.modality], HEIGHT, WIDTH)
+        observation_spec[keys.IMAGE] = Bounded(0, 255, shape, device, torch.uint8)
+        if self.appearance == "episode":
+            observation_spec[keys.APPEARANCE] = Unbounded((*batch, 1), device, torch.int64)
         return observation_spec
-
-
-def ground_rays() -> Tensor:
-    """Where the rays through the pixels below the horizon meet the road, from the vehicle's origin.
-
-    Pixel ``(row, column)`` looks along ``(1, (column + 0.5 - 100) / f, (row + 0.5 - 44) / f)`` forward, right and
-    down, with the focal length ``f = 100`` pixels.
-
-    Returns:
-        ``[8800, 3]`` float32: forward and right (m), and 1; row by row from the horizon down.
-    """
-    focal = WIDTH / 2 / math.tan(FIELD_OF_VIEW / 2)
-    down = (torch.arange(HEIGHT // 2) + 0.5) / focal
-    right = (torch.arange(WIDTH) + 0.5 - WIDTH / 2) / focal
-    distance = (ABOVE / down).unsqueeze(-1).expand(-1, WIDTH)
-    return torch.stack((FORWARD + distance, distance * right, torch.ones_like(distance)), -1).view(-1, 3)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ldrl.subtasks import SubTask
 from ldrl.towns import surface
 from ldrl.towns.layout import load_layout
+from ldrl.towns.scenery import Scenery
 
 __all__ = ["ROUTE_LANES", "Town"]
 
@@ -69,6 +70,8 @@ class Town(nn.Module):
     road_distance: Tensor
     lane_direction: Tensor
     raster_origin: Tensor
+    half_width: Tensor
+    shoulder = SHOULDER
 
     def __init__(self, name: str, network: RoadNetwork) -> None:
         super().__init__()
@@ -83,7 +86,10 @@ class Town(nn.Module):
         lanes = [network.get_lane(index) for index in self.lane_indices]
         self._register_lanes(lanes)
         self._register_links()
-        self._register_surface(max(lane.width_at(0) for lane in lanes) / 2 + SHOULDER)
+        self._buffer(
+            "half_width", torch.full((len(self.points),), max(lane.width_at(0) for lane in lanes) / 2 + SHOULDER)
+        )
+        self._register_surface()
 
     @classmethod
     def load(cls, name: str) -> Town:
@@ -140,8 +146,8 @@ class Town(nn.Module):
             distance += float(self.lane_length[lane])
         return math.inf
 
-    def _register_surface(self, half_width: float) -> None:
-        rasters = surface.rasterise(self.points, self.headings, half_width, LANE_SPACING)
+    def _register_surface(self) -> None:
+        rasters = surface.rasterise(self.points, self.headings, self.half_width, LANE_SPACING)
         lane_of_point = torch.searchsorted(self.lane_first, torch.arange(len(self.points)), right=True) - 1
         on_street = self.lane_manoeuvre[lane_of_point[rasters.nearest_point]] == SubTask.LANEFOLLOW
         on_street &= rasters.road_distance[0, 0] < 0
@@ -150,6 +156,13 @@ class Town(nn.Module):
         self._buffer("raster_origin", rasters.origin)
         self._buffer("road_distance", rasters.road_distance)
         self._buffer("lane_direction", direction.unsqueeze(0))
+
+    @property
+    def scenery(self) -> Scenery:
+        """What stands around the streets, built when first asked for."""
+        if "_scenery" not in self._modules:
+            self.add_module("_scenery", Scenery(self))
+        return self._modules["_scenery"]
 
     def successors(self, lane: int) -> list[int]:
         """Indices of the lanes that follow ``lane``."""
