@@ -23,7 +23,7 @@ PARTS = 3
 """Facades: wall, window, ground floor."""
 CAR_COLOURS = 5
 CAR_PARTS = 4
-"""Cars: body, side away from the light, windows, tyres."""
+"""Cars: roof, windows, body, tyres."""
 SKY_BANDS = 11
 
 
@@ -205,5 +205,5 @@ def _things(drawn: _Draws, light: Tensor, night: Tensor) -> Tensor:
     leaves = drawn.between([0.13, 0.32, 0.10], [0.52, 0.42, 0.14])
     lamp = torch.where(night, 3.0, 0.8).expand(-1, 1, 3)
     body = _CARS.to(light.device).expand(len(light), -1, 3)
-    part = torch.stack((body, body * 0.7, 0.15 + 0 * body, 0.06 + 0 * body), 2).flatten(1, 2)
+    part = torch.stack((body * 1.1, 0.15 + 0 * body, body * 0.85, 0.06 + 0 * body), 2).flatten(1, 2)
     return torch.cat((trunk, post, leaves * 0.8, leaves * 1.15, lamp, part), 1) * light.unsqueeze(1)

@@ -100,7 +100,8 @@ class DashCamera(Transform):
             number = appearance
         else:
             raise ValueError(f"appearance {appearance} is negative; use a number from 0 on or one of {WEATHERS}")
-        self.register_buffer("number", torch.tensor([number]), persistent=False)
+        for name, value in looks(torch.tensor([number]))._asdict().items():
+            self.register_buffer(name, value, persistent=False)
         self._numbers = torch.zeros(0, dtype=torch.long)
 
     def draw(self, pose: Tensor, traffic: Tensor | None = None, number: Tensor | None = None) -> Tensor:
@@ -123,30 +124,28 @@ class DashCamera(Transform):
             rows = slice(first, first + FRAMES_AT_ONCE)
             mount, others = Mount.on(pose[rows]), None if traffic is None else traffic[rows]
             if look is None:
-                images[rows, 0, HORIZON:] = self._road(mount, others)
+                torch.mul(self._road(mount, others), 255, out=images[rows, 0, HORIZON:])
             else:
-                images[rows] = paint(self.sight, self.scenery, mount, look.rows(rows), others)
-        if look is None:
-            images *= 255
+                paint(self.sight, self.scenery, mount, look.rows(rows), others, out=images[rows])
         return images.view(*batch, *images.shape[1:])
 
     def _look(self, count: int, number: Tensor | None) -> Look:
         """How things look in each image, or in all of them."""
         if number is None and self.appearance == "sample":
             number = self._draw_numbers(count)
-        return looks(self.number if number is None else number.reshape(-1))
+        return Look(self.colours, self.sun) if number is None else looks(number.reshape(-1))
 
     def _draw_numbers(self, count: int) -> Tensor:
-        return torch.randint(1 << 40, (count,), generator=self._generator).to(self.number.device)
+        return torch.randint(1 << 40, (count,), generator=self._generator).to(self.sun.device)
 
     def _road(self, mount: Mount, traffic: Tensor | None) -> Tensor:
         """Whether the rays below the horizon meet the road first: ``[N, 44, 200]`` bool."""
         ground, wall = self.sight.ground(self.scenery, mount)
         props = self.sight.props(self.scenery, mount, STEMS_IN_SIGHT)
-        nearest, _ = self.sight.obstacle(self.scenery, props, wall)
-        road = (ground <= Material.STOP_LINE).logical_and_(self.sight.sees_ground(nearest))
+        obstacles = self.sight.obstacles(self.scenery, props, wall)
+        road = (ground <= Material.STOP_LINE).logical_and_(self.sight.sees_ground(obstacles))
         if traffic is not None:
-            road &= ~self.sight.covers(self.sight.cars(mount, traffic), nearest).any(1)
+            road &= ~self.sight.covers(self.sight.cars(mount, traffic), obstacles).any(1)
         return road
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ldrl.envs.appearance import CAR_COLOURS, CAR_PARTS, CODES, PARTS, SHADES, SKY_BANDS, Code, Look, band_of
-from ldrl.envs.sight import ABOVE, Cars, Mount, Props, Sight
+from ldrl.envs.sight import ABOVE, FOCAL, HORIZON, Cars, Mount, Obstacles, Props, Sight, rows_within
 from ldrl.towns.scenery import STOREY, STYLES, Scenery
 from ldrl.towns.surface import CELL
 
@@ -22,6 +22,8 @@ LARGEST_POST = 0.5
 """A crown of a smaller radius is a lamp on a post, m."""
 WINDOW_SPACING = 2.6
 """Between the windows of a storey, m."""
+GROUND_FLOOR = 2
+"""Of the parts of a facade: wall, window, ground floor."""
 SUNNY, SHADY = 0.4, -0.2
 """Cosines of the angle to the sun above which a facade has full light, and below which it has none."""
 
@@ -30,19 +32,19 @@ class Facades(NamedTuple):
     """What the columns of pixels see of walls.
 
     Attributes:
-        depth: ``[N, 200]``, m; meaningless where ``top`` is -1.
-        top: ``[N, 200]``, where the wall ends, m up per m ahead; -1 where there is no wall.
+        depth: ``[N, 200]``, m; infinite where there is no wall.
+        rows: ``[N, 200]`` uint8, rows above the horizon up to the top of the wall.
         code: ``[N, 200]`` int16, colour of its wall part.
-        window: ``[N, 200]`` bool, whether the column passes through windows.
+        window: ``[N, 200]`` int16, 1 where the column passes through windows, else 0.
     """
 
     depth: Tensor
-    top: Tensor
+    rows: Tensor
     code: Tensor
     window: Tensor
 
 
-def paint(sight: Sight, scenery: Scenery, mount: Mount, look: Look, traffic: Tensor | None = None) -> Tensor:
+def paint(sight: Sight, scenery: Scenery, mount: Mount, look: Look, traffic: Tensor | None, out: Tensor) -> None:
     """Draw rgb images.
 
     Args:
@@ -51,40 +53,41 @@ def paint(sight: Sight, scenery: Scenery, mount: Mount, look: Look, traffic: Ten
         mount: N cameras.
         look: of each camera, or of one for all.
         traffic: other cars, ``[N, P, 4]``.
-
-    Returns:
-        ``[N, 3, 88, 200]`` uint8.
+        out: ``[N, 3, 88, 200]`` uint8, where to draw.
     """
     ground, first = sight.ground(scenery, mount)
     props = sight.props(scenery, mount, PROPS_IN_SIGHT)
-    nearest, stem = sight.obstacle(scenery, props, first)
-    post = scenery.props[props.index, 3].gather(1, stem.clamp(min=0)) < LARGEST_POST
+    obstacles = sight.obstacles(scenery, props, first)
     facades = _facades(sight, scenery, mount, first, look.sun)
+    post = scenery.props[props.prop, 3].gather(1, obstacles.stem.clamp(min=0)) < LARGEST_POST
+    stem = torch.where(post, Code.POST, Code.TRUNK).to(torch.int16) + CODES * band_of(obstacles.depth)
+    upright = torch.where(obstacles.stem >= 0, stem, facades.code + GROUND_FLOOR).unsqueeze(1)
     lower = ground + (CODES * band_of(sight.reach)).unsqueeze(-1)
-    stem_code = torch.where(post, Code.POST, Code.TRUNK) + CODES * band_of(nearest)
-    upright = torch.where(stem >= 0, stem_code, facades.code + 2).to(torch.int16)
-    lower = torch.where(sight.sees_ground(nearest), lower, upright.unsqueeze(1))
+    lower = torch.where(sight.sees_ground(obstacles), lower, upright)
     if traffic is not None:
-        lower = _with_cars(sight, sight.cars(mount, traffic), nearest, lower)
+        lower = _with_cars(sight, sight.cars(mount, traffic), obstacles, lower)
     upper = _with_crowns(sight, scenery, props, facades, _sky_and_walls(sight, scenery, mount, facades))
-    codes = torch.cat((upper.flip(1), lower), 1).int()
-    if len(look.colours) > 1:
-        codes += torch.arange(0, look.colours.numel(), look.colours.shape[1], device=codes.device).int().view(-1, 1, 1)
+    codes = torch.empty((len(ground), *out.shape[2:]), dtype=torch.int32, device=out.device)
+    codes[:, :HORIZON], codes[:, HORIZON:] = upper.flip(1), lower
+    if len(look.sun) > 1:
+        codes += torch.arange(0, look.colours.numel(), look.colours.shape[1], device=out.device).int().view(-1, 1, 1)
     colours = look.colours.view(-1).index_select(0, codes.view(-1)).view_as(codes)
-    return torch.stack((colours.to(torch.uint8), (colours >> 8).to(torch.uint8), (colours >> 16).to(torch.uint8)), 1)
+    for channel in range(3):
+        out[:, channel] = colours  # its lowest byte
+        colours >>= 8
 
 
 def _facades(sight: Sight, scenery: Scenery, mount: Mount, first: Tensor, sun: Tensor) -> Facades:
     """The first wall of each column: where exactly it stands between two depths, and how it is lit."""
     inside, height = scenery.walls.flatten(2)[0]
-    rows, columns = scenery.facade.shape
+    size_y, size_x = scenery.facade.shape
     look_x, look_y = mount.cos - sight.slope * mount.sin, mount.sin + sight.slope * mount.cos
 
     def cell(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, y = mount.xy[:, :1] + depth * look_x, mount.xy[:, 1:] + depth * look_y
-        column = ((x - scenery.corner[0]) / CELL).long().clamp(1, columns - 2)
-        row = ((y - scenery.corner[1]) / CELL).long().clamp(1, rows - 2)
-        return x, y, row * columns + column
+        column = ((x - scenery.corner[0]) / CELL).long().clamp(1, size_x - 2)
+        row = ((y - scenery.corner[1]) / CELL).long().clamp(1, size_y - 2)
+        return x, y, row * size_x + column
 
     beyond = sight.depths[first]
     there = beyond.isfinite()
@@ -93,30 +96,34 @@ def _facades(sight: Sight, scenery: Scenery, mount: Mount, first: Tensor, sun: T
     outside, within = inside[cell(before)[2]], inside[cell(beyond)[2]]
     depth = torch.lerp(before, beyond, (outside / (outside - within)).nan_to_num(0).clamp(0, 1))
     x, y, here = cell(depth + CELL)
-    normal_x, normal_y = inside[here - 1] - inside[here + 1], inside[here - columns] - inside[here + columns]
+    normal_x, normal_y = inside[here - 1] - inside[here + 1], inside[here - size_x] - inside[here + size_x]
     facing = (normal_x * sun[:, :1] + normal_y * sun[:, 1:]) / (2 * CELL)
     style = scenery.facade.view(-1)[here].to(torch.int16)
-    shade = (facing > SHADY).to(torch.int16) + (facing > SUNNY)
+    shade = (facing > SHADY).to(torch.int16) + (facing > SUNNY).to(torch.int16)
     along = torch.where(normal_x.abs() > normal_y.abs(), y, x) / WINDOW_SPACING
     window = ((along - along.floor() - 0.5).abs() < 0.22) & (style < STYLES)
-    top = torch.where(there, (height[here] - ABOVE) / depth, -1.0)
-    return Facades(depth, top, Code.FACADE + (style * SHADES + shade) * PARTS + CODES * band_of(depth), window)
+    rows = rows_within((height[here] - ABOVE) / depth) * there
+    code = (style * SHADES + shade) * PARTS + Code.FACADE + CODES * band_of(depth)
+    return Facades(torch.where(there, depth, torch.inf), rows, code, window.to(torch.int16))
 
 
 def _sky_and_walls(sight: Sight, scenery: Scenery, mount: Mount, facades: Facades) -> Tensor:
     """Codes of the rows above the horizon, from the horizon up, ``[N, 44, 200]`` int16, without props."""
-    up = sight.down.unsqueeze(-1)
-    sky = Code.SKY + torch.linspace(0, SKY_BANDS - 0.01, len(up), device=up.device).to(torch.int16).unsqueeze(-1)
+    rows, wall = sight.row, facades.code.unsqueeze(1)
+    sky = Code.SKY + (rows.int() * SKY_BANDS // HORIZON).to(torch.int16)
     skyline, behind = _skyline(sight, scenery, mount)
-    codes = torch.where(up < skyline.unsqueeze(1), behind.unsqueeze(1), sky)
-    storeys = (ABOVE + up * facades.depth.unsqueeze(1)) / STOREY
-    part = (((storeys - storeys.floor() - 0.55).abs() < 0.25) & facades.window.unsqueeze(1)).to(torch.int16)
-    part = torch.where(storeys < 1, 2, part)
-    return torch.where(up < facades.top.unsqueeze(1), facades.code.unsqueeze(1) + part, codes)
+    codes = torch.where(rows < skyline.unsqueeze(1), behind.unsqueeze(1), sky)
+    # How many storeys up a pixel looks, in 1024ths: whole numbers of 16 bits are quick.
+    per_row = (facades.depth * (1024 / FOCAL / STOREY)).clamp(max=700).to(torch.int16).unsqueeze(1)
+    storeys = (rows * per_row).add_(int(1024 * (ABOVE / STOREY + 0.2)))
+    window = storeys.bitwise_right_shift_(9).bitwise_and_(facades.window.unsqueeze(1))  # half a storey of two
+    ground_floor = torch.minimum(rows_within((STOREY - ABOVE) / facades.depth), facades.rows).unsqueeze(1)
+    codes = torch.where(rows < facades.rows.unsqueeze(1), window.add_(wall), codes)
+    return torch.where(rows < ground_floor, wall + GROUND_FLOOR, codes)
 
 
 def _skyline(sight: Sight, scenery: Scenery, mount: Mount) -> tuple[Tensor, Tensor]:
-    """What towers over the first walls: its slope and the code of its colour, ``[N, 200]``."""
+    """What towers over the first walls: rows, and the code of its colour, ``[N, 200]``."""
     rows, columns = scenery.facade.shape
     inside, height = scenery.walls.flatten(2)[0]
     x, y = mount.map(sight.far_rays, scenery.corner, 1 / CELL)
@@ -125,43 +132,42 @@ def _skyline(sight: Sight, scenery: Scenery, mount: Mount) -> tuple[Tensor, Tens
     depths = sight.far_depths.unsqueeze(-1)
     slope, at = ((tall.view(len(mount.xy), len(depths), -1) - ABOVE) / depths).max(1)
     style = scenery.facade.view(-1)[cell.view(len(slope), len(depths), -1).gather(1, at.unsqueeze(1)).squeeze(1)]
-    return slope, Code.FACADE + (style.to(torch.int16) * SHADES + 1) * PARTS + CODES * band_of(sight.far_depths)[at]
+    return rows_within(slope), Code.FACADE + (style.to(torch.int16) * SHADES + 1) * PARTS + CODES * band_of(
+        sight.far_depths
+    )[at]
 
 
 def _with_crowns(sight: Sight, scenery: Scenery, props: Props, facades: Facades, codes: Tensor) -> Tensor:
     """The codes of the rows above the horizon with trees and posts in front."""
-    shape = scenery.props[props.index, 2:].unsqueeze(-1)
-    hidden = (facades.top >= 0).unsqueeze(1) & (facades.depth.unsqueeze(1) < props.ahead)
-    hidden |= props.aside.abs() > shape[:, :, 1]
+    shape = scenery.props[props.prop, 2:].unsqueeze(-1)
+    hidden = (facades.depth.unsqueeze(1) < props.ahead) | (props.aside.abs() > shape[:, :, 1])
     depth, which = props.ahead.expand_as(hidden).masked_fill(hidden, torch.inf).topk(CROWNS, 1, largest=False)
     shape = shape.expand(-1, -1, -1, depth.shape[-1]).gather(1, which.unsqueeze(2).expand(-1, -1, 4, -1))
     stem, radius, bottom, top = shape.unbind(2)
     aside = props.aside.gather(1, which).abs()
     half = (top - bottom) / 2 * (1 - (aside / radius).square()).clamp(min=0).sqrt()
     middle = (top + bottom) / 2 - ABOVE
-    low, high = (middle - half) / depth, (middle + half) / depth
-    post = radius < LARGEST_POST
-    band = CODES * band_of(depth)
-    crown = torch.where(post, Code.LAMP, Code.FOLIAGE) + band
-    stem_code = torch.where(post, Code.POST, Code.TRUNK) + band
-    brighter = (~post).to(torch.int16)
-    low_of_stem = torch.where(aside < stem, low, 0)
-    up = sight.down.unsqueeze(-1)
+    low, centre, high = (rows_within((middle + side * half) / depth).unsqueeze(2) for side in (-1, 0, 1))
+    post, band = radius < LARGEST_POST, CODES * band_of(depth)
+    upper = (torch.where(post, Code.LAMP, Code.FOLIAGE + 1).to(torch.int16) + band).unsqueeze(2)
+    lower = (torch.where(post, Code.LAMP, Code.FOLIAGE).to(torch.int16) + band).unsqueeze(2)
+    stem_code = (torch.where(post, Code.POST, Code.TRUNK).to(torch.int16) + band).unsqueeze(2)
+    stem_rows = low * (aside < stem).unsqueeze(2)
     for k in reversed(range(CROWNS)):  # the nearest last
-        inside = (up > low[:, k, None]) & (up < high[:, k, None])
-        lit = crown[:, k, None] + (up > (middle / depth)[:, k, None]) * brighter[:, k, None]
-        codes = torch.where(up < low_of_stem[:, k, None], stem_code[:, k, None], torch.where(inside, lit, codes))
+        crown = torch.where(sight.row < centre[:, k], lower[:, k], upper[:, k])
+        inside = (sight.row - low[:, k]) < (high - low)[:, k]  # of unsigned numbers, which wrap around
+        codes = torch.where(inside, crown, codes)
+        codes = torch.where(sight.row < stem_rows[:, k], stem_code[:, k], codes)
     return codes
 
 
-def _with_cars(sight: Sight, cars: Cars, nearest: Tensor, codes: Tensor) -> Tensor:
+def _with_cars(sight: Sight, cars: Cars, obstacles: Obstacles, codes: Tensor) -> Tensor:
     """The codes of the rows below the horizon with cars in front."""
-    covered = sight.covers(cars, nearest)
-    down = sight.down.unsqueeze(-1)
+    covered = sight.covers(cars, obstacles)
+    body = (Code.CAR + CAR_PARTS * (cars.car % CAR_COLOURS)).to(torch.int16) + CODES * band_of(cars.near)
+    # From the top: roof, windows, body, and tyres down to the road.
+    edges = [rows_within((ABOVE - height) / cars.near).unsqueeze(2) for height in (1.4, 0.9, 0.3)]
     for k in reversed(range(covered.shape[1])):  # the nearest last
-        near = cars.near[:, k, None]
-        height = ABOVE - down * near
-        part = torch.where((height - 1.15).abs() < 0.25, 2, torch.where(height < 0.3, 3, (height < 0.95).short()))
-        colour = Code.CAR + CAR_PARTS * (cars.car[:, k, None] % CAR_COLOURS) + CODES * band_of(near)
-        codes = torch.where(covered[:, k], (colour + part).to(codes.dtype), codes)
+        part = sum((sight.row >= edge[:, k]).to(torch.int16) for edge in edges)
+        codes = torch.where(covered[:, k], body[:, k, None] + part, codes)
     return codes

@@ -13,7 +13,20 @@ from ldrl.envs import vehicle
 from ldrl.towns.scenery import PROP_CELL, TEXELS, Material, Scenery
 from ldrl.towns.surface import CELL
 
-__all__ = ["ABOVE", "FOCAL", "FORWARD", "HEIGHT", "HORIZON", "WIDTH", "Cars", "Mount", "Props", "Sight"]
+__all__ = [
+    "ABOVE",
+    "FOCAL",
+    "FORWARD",
+    "HEIGHT",
+    "HORIZON",
+    "WIDTH",
+    "Cars",
+    "Mount",
+    "Obstacles",
+    "Props",
+    "Sight",
+    "rows_within",
+]
 
 HEIGHT, WIDTH = 88, 200
 HORIZON = HEIGHT // 2
@@ -72,14 +85,28 @@ class Props(NamedTuple):
     """Trees and posts ahead of each camera, nearest first.
 
     Attributes:
-        index: ``[N, P]`` int64, into :attr:`~ldrl.towns.scenery.Scenery.props`.
+        prop: ``[N, P]`` int64, index into :attr:`~ldrl.towns.scenery.Scenery.props`.
         ahead: ``[N, P, 1]``, depth, infinite for those that are not ahead, m.
         aside: ``[N, P, 200]``, how far right of the axis each column's line of sight passes, m.
     """
 
-    index: Tensor
+    prop: Tensor
     ahead: Tensor
     aside: Tensor
+
+
+class Obstacles(NamedTuple):
+    """The nearest wall or stem in each column of pixels.
+
+    Attributes:
+        depth: ``[N, 200]``, infinite where there is none, m.
+        stem: ``[N, 200]`` int64, which of the props it is, -1 if none.
+        rows: ``[N, 200]`` uint8, rows below the horizon that it hides.
+    """
+
+    depth: Tensor
+    stem: Tensor
+    rows: Tensor
 
 
 class Cars(NamedTuple):
@@ -107,19 +134,19 @@ class Sight(nn.Module):
 
     Attributes:
         slope: ``[200]``, metres right per metre ahead of each column.
-        down: ``[44]``, metres down per metre ahead of the rows below the horizon, from the horizon down.
-        reach: ``[44]``, how far ahead these rows meet the ground, m.
+        row: ``[44, 1]`` uint8, numbers of rows, counted from the horizon up or down.
+        reach: ``[44]``, how far ahead the rows below the horizon meet the ground, m.
         depths: ``[D + 1]``, those of the rows, more depths between them, and infinity, ascending, m.
         far_depths: ``[20]``, where higher buildings are looked for behind lower ones, m.
         far_rays: ``[2, 20 * 200]``, points at these depths along each column, ahead and to the right, m.
     """
 
     slope: Tensor
-    down: Tensor
+    row: Tensor
     reach: Tensor
     depths: Tensor
     rays: Tensor
-    rows: Tensor
+    rows_beyond: Tensor
     rank: Tensor
     far_depths: Tensor
     far_rays: Tensor
@@ -133,15 +160,15 @@ class Sight(nn.Module):
         for near, far in pairwise(reach.flip(0).clamp(max=FARTHEST).tolist()):
             count = math.ceil((far / near - 1) / STEP)
             between.append(torch.linspace(near, far, count + 1)[1:-1])
-        depths = torch.cat(between).sort().values
+        depths, order = torch.cat(between).sort()
         self._buffer("slope", slope)
-        self._buffer("down", down)
         self._buffer("reach", reach)
         self._buffer("depths", nn.functional.pad(depths, (0, 1), value=math.inf))
-        self._buffer("rows", torch.searchsorted(depths, reach))
+        self._buffer("row", torch.arange(HORIZON, dtype=torch.uint8).unsqueeze(-1))
+        self._buffer("rows_beyond", (reach >= self.depths.unsqueeze(-1)).sum(-1).to(torch.uint8))
         self._buffer("far_depths", 10 * (FARTHEST / 10) ** torch.linspace(0, 1, 20))
-        self._buffer("rank", torch.arange(len(depths), 0, -1, dtype=torch.uint8).unsqueeze(-1))
-        self._buffer("rays", _fan(depths, slope))
+        self._buffer("rank", (len(depths) - order.argsort()).to(torch.uint8).unsqueeze(-1))
+        self._buffer("rays", _fan(torch.cat(between), slope))
         self._buffer("far_rays", _fan(self.far_depths, slope))
 
     def _buffer(self, name: str, value: Tensor) -> None:
@@ -159,7 +186,7 @@ class Sight(nn.Module):
         index = y.clamp_(0, height - 1).int().mul_(width).add_(x.clamp_(0, width - 1).int())
         ground = scenery.ground.view(-1).index_select(0, index.view(-1)).view(-1, len(self.rank), WIDTH)
         first = len(self.rank) - ((ground == Material.WALL) * self.rank).amax(1).long()
-        return ground[:, self.rows], first
+        return ground[:, :HORIZON], first
 
     def props(self, scenery: Scenery, mount: Mount, count: int) -> Props:
         """The nearest ``count`` trees and posts ahead."""
@@ -172,26 +199,24 @@ class Sight(nn.Module):
         right, ahead = right.gather(1, which).unsqueeze(-1), ahead.unsqueeze(-1)
         return Props(nearby.gather(1, which), ahead, torch.addcmul(-right, ahead, self.slope))
 
-    def obstacle(self, scenery: Scenery, props: Props, wall: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest wall or stem in each column: its depth (m), and which of ``props`` it is, -1 for a wall.
+    def obstacles(self, scenery: Scenery, props: Props, wall: Tensor) -> Obstacles:
+        """The nearest wall or stem in each column.
 
         Args:
             scenery: what there is to see.
             props: at least ``STEMS_IN_SIGHT``; the stems of further ones are not looked at.
             wall: ``[N, 200]`` int64, the first of ``depths`` inside a wall.
-
-        Returns:
-            Two ``[N, 200]``; the depth is infinite where there is nothing.
         """
-        radius = scenery.props[props.index[:, :STEMS_IN_SIGHT], 2].unsqueeze(-1)
+        radius = scenery.props[props.prop[:, :STEMS_IN_SIGHT], 2].unsqueeze(-1)
         hit = props.aside[:, :STEMS_IN_SIGHT].abs() < radius
-        stem, which = torch.where(hit, props.ahead[:, :STEMS_IN_SIGHT], torch.inf).min(1)
-        wall_depth = self.depths[wall]
-        return torch.minimum(wall_depth, stem), torch.where(stem < wall_depth, which, -1)
+        depth, stem = torch.where(hit, props.ahead[:, :STEMS_IN_SIGHT], torch.inf).min(1)
+        nearer = depth < self.depths[wall]
+        rows = torch.where(nearer, rows_within(ABOVE / depth), self.rows_beyond[wall])
+        return Obstacles(torch.where(nearer, depth, self.depths[wall]), torch.where(nearer, stem, -1), rows)
 
-    def sees_ground(self, nearest: Tensor) -> Tensor:
-        """Which pixels below the horizon see the ground, ``[N, 44, 200]`` bool, given :meth:`obstacle`'s depth."""
-        return self.reach.unsqueeze(-1) < nearest.unsqueeze(1)
+    def sees_ground(self, obstacles: Obstacles) -> Tensor:
+        """Which pixels below the horizon see the ground or a car, ``[N, 44, 200]`` bool."""
+        return self.row >= obstacles.rows.unsqueeze(1)
 
     def cars(self, mount: Mount, traffic: Tensor) -> Cars:
         """The nearest of other cars, ``[N, P, 4]``, in each column."""
@@ -216,17 +241,16 @@ class Sight(nn.Module):
         near, layer = torch.where(met, near, torch.inf).topk(min(LAYERS, near.shape[1]), 1, largest=False)
         return Cars(near, far.gather(1, layer), which.unsqueeze(-1).expand_as(met).gather(1, layer))
 
-    def covers(self, cars: Cars, hidden_beyond: Tensor) -> Tensor:
-        """Which pixels below the horizon each layer of cars covers, ``[N, 3, 44, 200]`` bool.
+    def covers(self, cars: Cars, obstacles: Obstacles) -> Tensor:
+        """Which pixels below the horizon each layer of cars covers, ``[N, 3, 44, 200]`` bool."""
+        first, last = rows_within((ABOVE - CAR_HEIGHT) / cars.far), rows_within(ABOVE / cars.near)
+        count = torch.where(cars.near < obstacles.depth.unsqueeze(1), last - first, 0)
+        return (self.row - first.unsqueeze(2)) < count.unsqueeze(2)  # of unsigned numbers, which wrap around
 
-        Args:
-            cars: the cars.
-            hidden_beyond: ``[N, 200]``, depth of the nearest other thing in the column, m.
-        """
-        near = torch.where(cars.near < hidden_beyond.unsqueeze(1), cars.near, torch.inf)
-        top = torch.where(near.isfinite(), (ABOVE - CAR_HEIGHT) / cars.far, torch.inf).unsqueeze(2)
-        down = self.down.unsqueeze(-1)
-        return (down >= top) & (down <= ABOVE / near.unsqueeze(2))
+
+def rows_within(slope: Tensor) -> Tensor:
+    """How many rows from the horizon look less steeply up or down than ``slope`` (m per m), uint8."""
+    return (slope * FOCAL + 0.5).clamp_(0, HORIZON).to(torch.uint8)
 
 
 def _fan(depths: Tensor, slopes: Tensor) -> Tensor:

@@ -237,7 +237,10 @@ class _Land:
             code.masked_fill_(centre & ~dash, Material.CENTRE_GAP)
         lane = self.lane[point]
         end = torch.where((self.town.lane_to_junction.cpu() == 0)[lane], self.length[lane], torch.inf)
-        stops = (end[:, None, :, None] - arc < 0.5) & (across.abs() < half) & whole
+        before = end[:, None, :, None] - arc
+        # A junction's lanes start where the lane before ends, and the ground there may be nearest to either.
+        begins = (self.town.lane_manoeuvre.cpu() != SubTask.LANEFOLLOW)[lane][:, None, :, None] & (arc < 0)
+        stops = (((before >= 0) & (before < 0.5)) | begins) & (across.abs() < half) & whole
         return code.masked_fill_(stops, Material.STOP_LINE)
 
     def _side_lines(self) -> list[Tensor]:

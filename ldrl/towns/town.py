@@ -44,6 +44,7 @@ class Town(nn.Module):
         lane_successor_count: ``[L]`` int64.
         lane_predecessor: ``[L]`` int64, one lane that leads into the lane.
         lane_to_junction: ``[L]`` float32, from the lane's end to the entry of the next junction, m.
+        half_width: ``[P]`` float32, half the width of the lane and its shoulder at each point, m.
         road_distance: ``[1, 1, H, W]`` float32, see :class:`~ldrl.towns.surface.Surface`.
         lane_direction: ``[1, 2, H, W]`` float32, unit vector along the nearest lane on the road outside junctions,
             zero elsewhere.
@@ -72,10 +73,12 @@ class Town(nn.Module):
     raster_origin: Tensor
     half_width: Tensor
     shoulder = SHOULDER
+    _scenery: Scenery | None
 
     def __init__(self, name: str, network: RoadNetwork) -> None:
         super().__init__()
         self.name = name
+        self.register_module("_scenery", None)
         self.network = network
         self.lane_indices = [
             (start, end, k)
@@ -160,9 +163,9 @@ class Town(nn.Module):
     @property
     def scenery(self) -> Scenery:
         """What stands around the streets, built when first asked for."""
-        if "_scenery" not in self._modules:
-            self.add_module("_scenery", Scenery(self))
-        return self._modules["_scenery"]
+        if self._scenery is None:
+            self._scenery = Scenery(self)
+        return self._scenery
 
     def successors(self, lane: int) -> list[int]:
         """Indices of the lanes that follow ``lane``."""
