@@ -30,7 +30,7 @@ SKY_BANDS = 11
 class Code:
     """Colour codes: those of the ground are :class:`~ldrl.towns.scenery.Material`."""
 
-    FACADE = 24  # by style, shade and part
+    FACADE = Material.YARD + 3  # by style, shade and part
     SKY = FACADE + (STYLES + 1) * SHADES * PARTS  # from the horizon up
     TRUNK = SKY + SKY_BANDS
     POST = TRUNK + 1
@@ -178,9 +178,7 @@ def _ground(drawn: _Draws, wet: Tensor) -> Tensor:
     road = [_shades(asphalt, 6, 0.12), _shades(asphalt * 0.72, 2, 0.05), edge, centre, gap, white, white]
     road = [torch.where(wet, colour * 0.7, colour) for colour in road]
     aside = [pavement * 1.15, _shades(pavement, 3, 0.05), _shades(lawn, 4, 0.1), _shades(yard, 3, 0.06)]
-    ground = torch.cat(road + aside, 1)
-    assert ground.shape[1] == Material.WALL
-    return ground
+    return torch.cat(road + aside, 1)
 
 
 def _facades(drawn: _Draws, sunlit: Tensor, night: Tensor, light: Tensor) -> Tensor:

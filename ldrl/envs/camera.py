@@ -119,12 +119,13 @@ class DashCamera(Transform):
         pose = shift(pose, self.lateral, self.yaw).reshape(-1, 3)
         traffic = None if traffic is None else traffic.reshape(len(pose), -1, 4)
         look = self._look(len(pose), number) if self.modality == "rgb" else None
-        images = pose.new_zeros((len(pose), CHANNELS[self.modality], HEIGHT, WIDTH), dtype=torch.uint8)
+        images = pose.new_empty((len(pose), CHANNELS[self.modality], HEIGHT, WIDTH), dtype=torch.uint8)
         for first in range(0, len(pose), FRAMES_AT_ONCE):
             rows = slice(first, first + FRAMES_AT_ONCE)
             mount, others = Mount.on(pose[rows]), None if traffic is None else traffic[rows]
             if look is None:
-                torch.mul(self._road(mount, others), 255, out=images[rows, 0, HORIZON:])
+                images[rows, 0, :HORIZON] = 0
+                images[rows, 0, HORIZON:] = self._road(mount, others)
             else:
                 paint(self.sight, self.scenery, mount, look.rows(rows), others, out=images[rows])
         return images.view(*batch, *images.shape[1:])
@@ -139,14 +140,15 @@ class DashCamera(Transform):
         return torch.randint(1 << 40, (count,), generator=self._generator).to(self.sun.device)
 
     def _road(self, mount: Mount, traffic: Tensor | None) -> Tensor:
-        """Whether the rays below the horizon meet the road first: ``[N, 44, 200]`` bool."""
+        """Whether the rays below the horizon meet the road first: ``[N, 44, 200]`` uint8, 255 or 0."""
         ground, wall = self.sight.ground(self.scenery, mount)
         props = self.sight.props(self.scenery, mount, STEMS_IN_SIGHT)
         obstacles = self.sight.obstacles(self.scenery, props, wall)
-        road = (ground <= Material.STOP_LINE).logical_and_(self.sight.sees_ground(obstacles))
+        hidden = self.sight.within(obstacles.rows)
         if traffic is not None:
-            road &= ~self.sight.covers(self.sight.cars(mount, traffic), obstacles).any(1)
-        return road
+            hidden |= self.sight.covers(self.sight.cars(mount, traffic), obstacles).amin(1)
+        road = (ground - (Material.STOP_LINE + 1)) >> 7  # the road's numbers wrap around to more than 127
+        return road.neg_().bitwise_and_(hidden.bitwise_not_().to(torch.uint8))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.appearance == "episode" and keys.APPEARANCE not in next_tensordict.keys(True):

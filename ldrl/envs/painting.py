@@ -8,7 +8,19 @@ import torch
 from torch import Tensor
 
 from ldrl.envs.appearance import CAR_COLOURS, CAR_PARTS, CODES, PARTS, SHADES, SKY_BANDS, Code, Look, band_of
-from ldrl.envs.sight import ABOVE, FOCAL, HORIZON, Cars, Mount, Obstacles, Props, Sight, rows_within
+from ldrl.envs.sight import (
+    ABOVE,
+    FOCAL,
+    HORIZON,
+    Cars,
+    Mount,
+    Obstacles,
+    Props,
+    Sight,
+    choose,
+    nearest_first,
+    rows_within,
+)
 from ldrl.towns.scenery import STOREY, STYLES, Scenery
 from ldrl.towns.surface import CELL
 
@@ -33,7 +45,7 @@ class Facades(NamedTuple):
 
     Attributes:
         depth: ``[N, 200]``, m; infinite where there is no wall.
-        rows: ``[N, 200]`` uint8, rows above the horizon up to the top of the wall.
+        rows: ``[N, 200]`` int16, rows above the horizon up to the top of the wall.
         code: ``[N, 200]`` int16, colour of its wall part.
         window: ``[N, 200]`` int16, 1 where the column passes through windows, else 0.
     """
@@ -63,7 +75,7 @@ def paint(sight: Sight, scenery: Scenery, mount: Mount, look: Look, traffic: Ten
     stem = torch.where(post, Code.POST, Code.TRUNK).to(torch.int16) + CODES * band_of(obstacles.depth)
     upright = torch.where(obstacles.stem >= 0, stem, facades.code + GROUND_FLOOR).unsqueeze(1)
     lower = ground + (CODES * band_of(sight.reach)).unsqueeze(-1)
-    lower = torch.where(sight.sees_ground(obstacles), lower, upright)
+    lower = choose(sight.within(obstacles.rows), upright, lower)
     if traffic is not None:
         lower = _with_cars(sight, sight.cars(mount, traffic), obstacles, lower)
     upper = _with_crowns(sight, scenery, props, facades, _sky_and_walls(sight, scenery, mount, facades))
@@ -72,9 +84,7 @@ def paint(sight: Sight, scenery: Scenery, mount: Mount, look: Look, traffic: Ten
     if len(look.sun) > 1:
         codes += torch.arange(0, look.colours.numel(), look.colours.shape[1], device=out.device).int().view(-1, 1, 1)
     colours = look.colours.view(-1).index_select(0, codes.view(-1)).view_as(codes)
-    for channel in range(3):
-        out[:, channel] = colours  # its lowest byte
-        colours >>= 8
+    out.copy_(colours.view(torch.uint8).view(*codes.shape, 4)[..., :3].movedim(-1, 1))
 
 
 def _facades(sight: Sight, scenery: Scenery, mount: Mount, first: Tensor, sun: Tensor) -> Facades:
@@ -109,55 +119,57 @@ def _facades(sight: Sight, scenery: Scenery, mount: Mount, first: Tensor, sun: T
 
 def _sky_and_walls(sight: Sight, scenery: Scenery, mount: Mount, facades: Facades) -> Tensor:
     """Codes of the rows above the horizon, from the horizon up, ``[N, 44, 200]`` int16, without props."""
-    rows, wall = sight.row, facades.code.unsqueeze(1)
-    sky = Code.SKY + (rows.int() * SKY_BANDS // HORIZON).to(torch.int16)
+    wall = facades.code.unsqueeze(1)
+    sky = (Code.SKY + sight.row * SKY_BANDS // HORIZON).expand(-1, wall.shape[-1])
     skyline, behind = _skyline(sight, scenery, mount)
-    codes = torch.where(rows < skyline.unsqueeze(1), behind.unsqueeze(1), sky)
-    # How many storeys up a pixel looks, in 1024ths: whole numbers of 16 bits are quick.
+    codes = choose(sight.within(skyline), behind.unsqueeze(1), sky)
+    # How many storeys up a pixel looks, in 1024ths.
     per_row = (facades.depth * (1024 / FOCAL / STOREY)).clamp(max=700).to(torch.int16).unsqueeze(1)
-    storeys = (rows * per_row).add_(int(1024 * (ABOVE / STOREY + 0.2)))
-    window = storeys.bitwise_right_shift_(9).bitwise_and_(facades.window.unsqueeze(1))  # half a storey of two
-    ground_floor = torch.minimum(rows_within((STOREY - ABOVE) / facades.depth), facades.rows).unsqueeze(1)
-    codes = torch.where(rows < facades.rows.unsqueeze(1), window.add_(wall), codes)
-    return torch.where(rows < ground_floor, wall + GROUND_FLOOR, codes)
+    storeys = (sight.row * per_row).add_(int(1024 * (ABOVE / STOREY + 0.2)))
+    window = storeys.bitwise_right_shift_(9).bitwise_and_(facades.window.unsqueeze(1))  # every other half storey
+    codes = choose(sight.within(facades.rows), window.add_(wall), codes)
+    ground_floor = torch.minimum(rows_within((STOREY - ABOVE) / facades.depth), facades.rows)
+    return choose(sight.within(ground_floor), wall + GROUND_FLOOR, codes)
 
 
 def _skyline(sight: Sight, scenery: Scenery, mount: Mount) -> tuple[Tensor, Tensor]:
     """What towers over the first walls: rows, and the code of its colour, ``[N, 200]``."""
-    rows, columns = scenery.facade.shape
+    size_y, size_x = scenery.facade.shape
     inside, height = scenery.walls.flatten(2)[0]
     x, y = mount.map(sight.far_rays, scenery.corner, 1 / CELL)
-    cell = y.clamp_(0, rows - 1).int().mul_(columns).add_(x.clamp_(0, columns - 1).int()).view(-1)
+    cell = y.clamp_(0, size_y - 1).int().mul_(size_x).add_(x.clamp_(0, size_x - 1).int()).view(-1)
     tall = torch.where(inside.index_select(0, cell) > 0, height.index_select(0, cell), 0.0)
-    depths = sight.far_depths.unsqueeze(-1)
-    slope, at = ((tall.view(len(mount.xy), len(depths), -1) - ABOVE) / depths).max(1)
-    style = scenery.facade.view(-1)[cell.view(len(slope), len(depths), -1).gather(1, at.unsqueeze(1)).squeeze(1)]
-    return rows_within(slope), Code.FACADE + (style.to(torch.int16) * SHADES + 1) * PARTS + CODES * band_of(
-        sight.far_depths
-    )[at]
+    depths = sight.far_depths
+    rows = rows_within((tall.view(len(mount.xy), len(depths), -1) - ABOVE) / depths.unsqueeze(-1))
+    # Rows and, in the lowest bits, which depth: the greatest of such numbers has both.
+    order = torch.arange(31, 31 - len(depths), -1, dtype=torch.int16, device=depths.device).unsqueeze(-1)
+    greatest = (rows * 32 + order).amax(1)
+    at = 31 - (greatest & 31).long()
+    style = scenery.facade.view(-1)[cell.view_as(rows).gather(1, at.unsqueeze(1)).squeeze(1)]
+    return greatest >> 5, (style.to(torch.int16) * SHADES + 1) * PARTS + Code.FACADE + CODES * band_of(depths)[at]
 
 
 def _with_crowns(sight: Sight, scenery: Scenery, props: Props, facades: Facades, codes: Tensor) -> Tensor:
     """The codes of the rows above the horizon with trees and posts in front."""
     shape = scenery.props[props.prop, 2:].unsqueeze(-1)
-    hidden = (facades.depth.unsqueeze(1) < props.ahead) | (props.aside.abs() > shape[:, :, 1])
-    depth, which = props.ahead.expand_as(hidden).masked_fill(hidden, torch.inf).topk(CROWNS, 1, largest=False)
+    seen = (facades.depth.unsqueeze(1) > props.ahead) & (props.aside.abs() < shape[:, :, 1])
+    which, found = nearest_first(seen, CROWNS)
+    depth = torch.where(found, props.ahead.squeeze(-1).gather(1, which.flatten(1)).view_as(which), torch.inf)
     shape = shape.expand(-1, -1, -1, depth.shape[-1]).gather(1, which.unsqueeze(2).expand(-1, -1, 4, -1))
     stem, radius, bottom, top = shape.unbind(2)
     aside = props.aside.gather(1, which).abs()
     half = (top - bottom) / 2 * (1 - (aside / radius).square()).clamp(min=0).sqrt()
     middle = (top + bottom) / 2 - ABOVE
-    low, centre, high = (rows_within((middle + side * half) / depth).unsqueeze(2) for side in (-1, 0, 1))
+    low, centre, high = (rows_within((middle + side * half) / depth) for side in (-1, 0, 1))
     post, band = radius < LARGEST_POST, CODES * band_of(depth)
     upper = (torch.where(post, Code.LAMP, Code.FOLIAGE + 1).to(torch.int16) + band).unsqueeze(2)
     lower = (torch.where(post, Code.LAMP, Code.FOLIAGE).to(torch.int16) + band).unsqueeze(2)
     stem_code = (torch.where(post, Code.POST, Code.TRUNK).to(torch.int16) + band).unsqueeze(2)
-    stem_rows = low * (aside < stem).unsqueeze(2)
+    stem_rows = low * (aside < stem)
     for k in reversed(range(CROWNS)):  # the nearest last
-        crown = torch.where(sight.row < centre[:, k], lower[:, k], upper[:, k])
-        inside = (sight.row - low[:, k]) < (high - low)[:, k]  # of unsigned numbers, which wrap around
-        codes = torch.where(inside, crown, codes)
-        codes = torch.where(sight.row < stem_rows[:, k], stem_code[:, k], codes)
+        crown = choose(sight.within(centre[:, k]), lower[:, k], upper[:, k])
+        codes = choose(sight.within(high[:, k]) & ~sight.within(low[:, k]), crown, codes)
+        codes = choose(sight.within(stem_rows[:, k]), stem_code[:, k], codes)
     return codes
 
 
@@ -166,8 +178,8 @@ def _with_cars(sight: Sight, cars: Cars, obstacles: Obstacles, codes: Tensor) ->
     covered = sight.covers(cars, obstacles)
     body = (Code.CAR + CAR_PARTS * (cars.car % CAR_COLOURS)).to(torch.int16) + CODES * band_of(cars.near)
     # From the top: roof, windows, body, and tyres down to the road.
-    edges = [rows_within((ABOVE - height) / cars.near).unsqueeze(2) for height in (1.4, 0.9, 0.3)]
+    edges = [rows_within((ABOVE - height) / cars.near) for height in (1.4, 0.9, 0.3)]
     for k in reversed(range(covered.shape[1])):  # the nearest last
-        part = sum((sight.row >= edge[:, k]).to(torch.int16) for edge in edges)
-        codes = torch.where(covered[:, k], body[:, k, None] + part, codes)
+        part = len(edges) + sum(sight.within(edge[:, k]) for edge in edges)
+        codes = choose(covered[:, k], body[:, k, None] + part, codes)
     return codes

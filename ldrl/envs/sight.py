@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ldrl.envs import vehicle
-from ldrl.towns.scenery import PROP_CELL, TEXELS, Material, Scenery
+from ldrl.towns.scenery import PROP_CELL, TEXELS, Scenery
 from ldrl.towns.surface import CELL
 
 __all__ = [
@@ -101,7 +101,7 @@ class Obstacles(NamedTuple):
     Attributes:
         depth: ``[N, 200]``, infinite where there is none, m.
         stem: ``[N, 200]`` int64, which of the props it is, -1 if none.
-        rows: ``[N, 200]`` uint8, rows below the horizon that it hides.
+        rows: ``[N, 200]`` int16, rows below the horizon that it hides.
     """
 
     depth: Tensor
@@ -134,7 +134,7 @@ class Sight(nn.Module):
 
     Attributes:
         slope: ``[200]``, metres right per metre ahead of each column.
-        row: ``[44, 1]`` uint8, numbers of rows, counted from the horizon up or down.
+        row: ``[44, 1]`` int16, numbers of rows, counted from the horizon up or down.
         reach: ``[44]``, how far ahead the rows below the horizon meet the ground, m.
         depths: ``[D + 1]``, those of the rows, more depths between them, and infinity, ascending, m.
         far_depths: ``[20]``, where higher buildings are looked for behind lower ones, m.
@@ -164,8 +164,8 @@ class Sight(nn.Module):
         self._buffer("slope", slope)
         self._buffer("reach", reach)
         self._buffer("depths", nn.functional.pad(depths, (0, 1), value=math.inf))
-        self._buffer("row", torch.arange(HORIZON, dtype=torch.uint8).unsqueeze(-1))
-        self._buffer("rows_beyond", (reach >= self.depths.unsqueeze(-1)).sum(-1).to(torch.uint8))
+        self._buffer("row", torch.arange(HORIZON, dtype=torch.int16).unsqueeze(-1))
+        self._buffer("rows_beyond", (reach >= self.depths.unsqueeze(-1)).sum(-1).to(torch.int16))
         self._buffer("far_depths", 10 * (FARTHEST / 10) ** torch.linspace(0, 1, 20))
         self._buffer("rank", (len(depths) - order.argsort()).to(torch.uint8).unsqueeze(-1))
         self._buffer("rays", _fan(torch.cat(between), slope))
@@ -185,7 +185,7 @@ class Sight(nn.Module):
         x, y = mount.map(self.rays, scenery.corner, TEXELS / CELL)
         index = y.clamp_(0, height - 1).int().mul_(width).add_(x.clamp_(0, width - 1).int())
         ground = scenery.ground.view(-1).index_select(0, index.view(-1)).view(-1, len(self.rank), WIDTH)
-        first = len(self.rank) - ((ground == Material.WALL) * self.rank).amax(1).long()
+        first = len(self.rank) - ((ground >> 7) * self.rank).amax(1).long()  # the highest bit says wall
         return ground[:, :HORIZON], first
 
     def props(self, scenery: Scenery, mount: Mount, count: int) -> Props:
@@ -209,14 +209,23 @@ class Sight(nn.Module):
         """
         radius = scenery.props[props.prop[:, :STEMS_IN_SIGHT], 2].unsqueeze(-1)
         hit = props.aside[:, :STEMS_IN_SIGHT].abs() < radius
-        depth, stem = torch.where(hit, props.ahead[:, :STEMS_IN_SIGHT], torch.inf).min(1)
+        stem, found = (nearest.squeeze(1) for nearest in nearest_first(hit, 1))
+        depth = torch.where(found, props.ahead.squeeze(-1).gather(1, stem), torch.inf)
         nearer = depth < self.depths[wall]
         rows = torch.where(nearer, rows_within(ABOVE / depth), self.rows_beyond[wall])
         return Obstacles(torch.where(nearer, depth, self.depths[wall]), torch.where(nearer, stem, -1), rows)
 
-    def sees_ground(self, obstacles: Obstacles) -> Tensor:
-        """Which pixels below the horizon see the ground or a car, ``[N, 44, 200]`` bool."""
-        return self.row >= obstacles.rows.unsqueeze(1)
+    def within(self, rows: Tensor) -> Tensor:
+        """Which pixels lie in the first ``rows`` rows from the horizon.
+
+        Args:
+            rows: ``[*B, 200]`` int16.
+
+        Returns:
+            ``[*B, 44, 200]`` int16: -1, all bits, or 0. Choosing by such a mask (:func:`choose`) takes a fifth of the
+            time that comparing and ``torch.where`` take on a CPU.
+        """
+        return (self.row - rows.unsqueeze(-2)).bitwise_right_shift_(15)
 
     def cars(self, mount: Mount, traffic: Tensor) -> Cars:
         """The nearest of other cars, ``[N, P, 4]``, in each column."""
@@ -238,19 +247,45 @@ class Sight(nn.Module):
         middle = -start / look
         near, far = (middle - reach).amax(0), (middle + reach).amin(0)
         met = (near < far) & (near > 0.1) & distance.isfinite().unsqueeze(-1)
-        near, layer = torch.where(met, near, torch.inf).topk(min(LAYERS, near.shape[1]), 1, largest=False)
+        layer, found = nearest_first(met, LAYERS)
+        near = torch.where(found, near.gather(1, layer), torch.inf)
         return Cars(near, far.gather(1, layer), which.unsqueeze(-1).expand_as(met).gather(1, layer))
 
     def covers(self, cars: Cars, obstacles: Obstacles) -> Tensor:
-        """Which pixels below the horizon each layer of cars covers, ``[N, 3, 44, 200]`` bool."""
+        """Which pixels below the horizon each layer of cars covers: a mask ``[N, 3, 44, 200]`` as of :meth:`within`."""
         first, last = rows_within((ABOVE - CAR_HEIGHT) / cars.far), rows_within(ABOVE / cars.near)
-        count = torch.where(cars.near < obstacles.depth.unsqueeze(1), last - first, 0)
-        return (self.row - first.unsqueeze(2)) < count.unsqueeze(2)  # of unsigned numbers, which wrap around
+        last = torch.where(cars.near < obstacles.depth.unsqueeze(1), last, 0)
+        return self.within(last) & ~self.within(first)
 
 
 def rows_within(slope: Tensor) -> Tensor:
-    """How many rows from the horizon look less steeply up or down than ``slope`` (m per m), uint8."""
-    return (slope * FOCAL + 0.5).clamp_(0, HORIZON).to(torch.uint8)
+    """How many rows from the horizon look less steeply up or down than ``slope`` (m per m), int16."""
+    return (slope * FOCAL + 0.5).clamp_(0, HORIZON).to(torch.int16)
+
+
+def nearest_first(seen: Tensor, layers: int) -> tuple[Tensor, Tensor]:
+    """The first few that are seen in each column; what ``topk`` would find in ten times the time.
+
+    Args:
+        seen: ``[N, P, 200]`` bool, in the order of their distance.
+        layers: how many to find.
+
+    Returns:
+        ``[N, layers, 200]`` int64 index into P, and bool, whether there is one; where there is none, the index is 0.
+    """
+    rank = seen * torch.arange(seen.shape[1], 0, -1, dtype=torch.int16, device=seen.device).unsqueeze(-1)
+    found = []
+    for _ in range(layers):
+        best = rank.amax(1, keepdim=True)
+        found.append(best)
+        rank = rank * (rank < best)
+    best = torch.cat(found, 1).long()
+    return (seen.shape[1] - best) % seen.shape[1], best > 0
+
+
+def choose(mask: Tensor, chosen: Tensor, other: Tensor) -> Tensor:
+    """``chosen`` where the mask's bits are set, else ``other``; all integers."""
+    return (mask & (chosen ^ other)).bitwise_xor_(other)
 
 
 def _fan(depths: Tensor, slopes: Tensor) -> Tensor:

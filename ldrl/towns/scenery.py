@@ -53,7 +53,7 @@ class Material(IntEnum):
     SIDEWALK = 14  # three shades
     GRASS = 17  # four shades
     YARD = 21  # three shades
-    WALL = 24
+    WALL = 128  # the only one with this bit
 
 
 class Scenery(nn.Module):
