@@ -7,7 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ldrl.towns.scenery import STYLES, Material, hash_uniform
+from ldrl.towns.ground import Material
+from ldrl.towns.noise import hash_uniform
+from ldrl.towns.scenery import STYLES
 
 __all__ = ["BANDS", "CODES", "WEATHERS", "Code", "Look", "appearance_number", "looks"]
 
@@ -28,7 +30,7 @@ SKY_BANDS = 11
 
 
 class Code:
-    """Colour codes: those of the ground are :class:`~ldrl.towns.scenery.Material`."""
+    """Colour codes: those of the ground are :class:`~ldrl.towns.ground.Material`."""
 
     FACADE = Material.YARD + 3  # by style, shade and part
     SKY = FACADE + (STYLES + 1) * SHADES * PARTS  # from the horizon up

@@ -15,7 +15,7 @@ from ldrl.envs.appearance import WEATHERS, Look, appearance_number, looks
 from ldrl.envs.painting import paint
 from ldrl.envs.sight import HEIGHT, HORIZON, STEMS_IN_SIGHT, WIDTH, Mount, Sight
 from ldrl.towns import Town
-from ldrl.towns.scenery import Material
+from ldrl.towns.ground import Material
 
 __all__ = ["DashCamera", "shift"]
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ldrl.envs import vehicle
-from ldrl.towns.scenery import PROP_CELL, TEXELS, Scenery
+from ldrl.towns.ground import TEXELS
+from ldrl.towns.scenery import PROP_CELL, Scenery
 from ldrl.towns.surface import CELL
 
 __all__ = [
@@ -178,7 +179,7 @@ class Sight(nn.Module):
         """What the ground is made of, as if nothing stood on it, and where the first wall is.
 
         Returns:
-            ``[N, 44, 200]`` uint8 :class:`~ldrl.towns.scenery.Material` below the horizon, from the horizon down, and
+            ``[N, 44, 200]`` uint8 :class:`~ldrl.towns.ground.Material` below the horizon, from the horizon down, and
             ``[N, 200]`` int64, the first of ``depths`` inside a wall, the last of all where there is none.
         """
         height, width = scenery.ground.shape

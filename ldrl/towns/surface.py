@@ -9,10 +9,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-__all__ = ["CELL", "MARGIN", "Surface", "rasterise", "sample"]
+__all__ = ["CELL", "LANE_SPACING", "MARGIN", "Surface", "rasterise", "sample"]
 
 CELL = 0.5
 """Edge of a raster cell, m."""
+LANE_SPACING = 0.5
+"""Largest distance between two samples of a lane's centre line, m."""
 MARGIN = 8.0
 """How far a town's rasters reach beyond the edge of the road, and the largest distance they tell, m."""
 

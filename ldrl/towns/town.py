@@ -13,11 +13,10 @@ from ldrl.subtasks import SubTask
 from ldrl.towns import surface
 from ldrl.towns.layout import load_layout
 from ldrl.towns.scenery import Scenery
+from ldrl.towns.surface import LANE_SPACING
 
 __all__ = ["ROUTE_LANES", "Town"]
 
-LANE_SPACING = 0.5
-"""Largest distance between two samples of a lane's centre line, m."""
 SHOULDER = 0.3
 """Drivable strip outside the outermost lanes, as in CARLA's towns, m."""
 ROUTE_LANES = 6

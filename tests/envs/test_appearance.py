@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ldrl.envs.appearance import BANDS, CODES, WEATHERS, Code, appearance_number, band_depths, band_of, looks
-from ldrl.towns.scenery import Material
+from ldrl.towns.ground import Material
 
 
 def channels(look):

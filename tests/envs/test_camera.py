@@ -17,8 +17,8 @@ from ldrl.envs.camera import shift
 from ldrl.envs.sight import Mount
 from ldrl.subtasks import MANOEUVRES
 from ldrl.towns import Layout, Town
+from ldrl.towns.ground import TEXELS, Material
 from ldrl.towns.layout import Node
-from ldrl.towns.scenery import TEXELS, Material
 from ldrl.towns.surface import CELL, sample
 
 TEXEL = CELL / TEXELS

@@ -4,8 +4,10 @@ import pytest
 import torch
 
 from ldrl.towns import Layout, Town
+from ldrl.towns.ground import SIDEWALK, TEXELS, Material
 from ldrl.towns.layout import Node
-from ldrl.towns.scenery import NEARBY, PROP_CELL, SIDEWALK, STYLES, TEXELS, Material, Scenery, hash_uniform
+from ldrl.towns.noise import hash_uniform
+from ldrl.towns.scenery import NEARBY, PROP_CELL, STYLES, Scenery
 from ldrl.towns.surface import CELL, sample
 
 TEXEL = CELL / TEXELS
