@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
+from highway_env.road.lane import AbstractLane
 from highway_env.road.road import RoadNetwork
 from torch import Tensor, nn
 
 from ldrl.subtasks import SubTask
-from ldrl.towns import surface
+from ldrl.towns import opendrive, surface
 from ldrl.towns.layout import load_layout
 
 __all__ = ["ROUTE_LANES", "Town"]
@@ -83,26 +85,30 @@ class Town(nn.Module):
         lanes = [network.get_lane(index) for index in self.lane_indices]
         self._register_lanes(lanes)
         self._register_links()
-        self._register_surface(max(lane.width_at(0) for lane in lanes) / 2 + SHOULDER)
+        self._register_surface(lanes)
 
     @classmethod
     def load(cls, name: str) -> Town:
-        """A built-in town.
+        """A built-in town, or the map in an OpenDRIVE file.
 
         Args:
-            name: ``"town1"`` or ``"town2"``.
+            name: ``"town1"``, ``"town2"`` or the path of a file that ends in ``.xodr``, see
+                :func:`~ldrl.towns.opendrive.load_network`. The town of a file is named like the file, without folder.
 
         Raises:
-            ValueError: no town has that name.
+            FileNotFoundError: there is no such file.
+            ValueError: no town has that name, or no town can be made of the file.
         """
+        if name.endswith(".xodr"):
+            return cls(Path(name).name, opendrive.load_network(name))
         return cls(name, load_layout(name).network())
 
     def _buffer(self, name: str, value: Tensor | np.ndarray | list) -> None:
         self.register_buffer(name, torch.as_tensor(value), persistent=False)
 
     def _register_lanes(self, lanes: list) -> None:
-        counts = [max(1, math.ceil(lane.length / LANE_SPACING)) for lane in lanes]
-        stations = [np.linspace(0, lane.length, n + 1) for lane, n in zip(lanes, counts, strict=True)]
+        stations = [_stations(lane) for lane in lanes]
+        counts = [len(along) - 1 for along in stations]
         points = [[lane.position(s, 0) for s in along] for lane, along in zip(lanes, stations, strict=True)]
         headings = [np.unwrap([lane.heading_at(s) for s in along]) for lane, along in zip(lanes, stations, strict=True)]
         self._buffer("points", np.concatenate(points).astype(np.float32))
@@ -140,8 +146,12 @@ class Town(nn.Module):
             distance += float(self.lane_length[lane])
         return math.inf
 
-    def _register_surface(self, half_width: float) -> None:
-        rasters = surface.rasterise(self.points, self.headings, half_width, LANE_SPACING)
+    def _register_surface(self, lanes: list) -> None:
+        half_widths = [lane.width_at(s) / 2 + SHOULDER for lane in lanes for s in _stations(lane)]
+        try:
+            rasters = surface.rasterise(self.points, self.headings, torch.tensor(half_widths), LANE_SPACING)
+        except ValueError as error:
+            raise ValueError(f"town {self.name!r}: {error}") from None
         lane_of_point = torch.searchsorted(self.lane_first, torch.arange(len(self.points)), right=True) - 1
         on_street = self.lane_manoeuvre[lane_of_point[rasters.nearest_point]] == SubTask.LANEFOLLOW
         on_street &= rasters.road_distance[0, 0] < 0
@@ -226,3 +236,8 @@ class Town(nn.Module):
     def extra_repr(self) -> str:
         """Name and size."""
         return f"{self.name!r}, {len(self.lane_length)} lanes, {float(self.lane_length.sum()) / 1000:.1f} km"
+
+
+def _stations(lane: AbstractLane) -> np.ndarray:
+    """The arc lengths at which a lane is sampled, both ends included, m."""
+    return np.linspace(0, lane.length, max(1, math.ceil(lane.length / LANE_SPACING)) + 1)
