@@ -50,7 +50,8 @@ def rasterise(points: Tensor, headings: Tensor, half_width: Tensor, spacing: flo
     Raises:
         ValueError: the rasters would be too large.
     """
-    border = float(half_width.max()) + MARGIN
+    widest = float(half_width.max())
+    border = widest + MARGIN
     origin = points.amin(0) - border
     width, height = ((points.amax(0) + border - origin) / CELL).ceil().int().add(1).tolist()
     if height * width > MAX_CELLS:
@@ -59,7 +60,7 @@ def rasterise(points: Tensor, headings: Tensor, half_width: Tensor, spacing: flo
     reach = math.ceil(border / CELL)
     steps = torch.arange(-reach, reach + 1)
     window = torch.cartesian_prod(steps, steps).flip(-1)
-    distance = torch.full((height * width,), MARGIN)
+    distance = torch.full((height * width,), border)
     nearest = torch.zeros(height * width, dtype=torch.long)
     tangents = torch.stack((headings.cos(), headings.sin()), -1)
     for rows in torch.arange(len(points)).split(256):
@@ -67,14 +68,16 @@ def rasterise(points: Tensor, headings: Tensor, half_width: Tensor, spacing: flo
         offset = cells * CELL + origin - points[rows][:, None]
         tangent = tangents[rows][:, None]
         along = (offset * tangent).sum(-1, keepdim=True).clamp(-spacing / 2, spacing / 2)
-        value = (offset - along * tangent).norm(dim=-1) - half_width[rows][:, None]
+        # How far beyond the edge of the road, plus the widest half width: as exact as a distance to the centre line.
+        value = (offset - along * tangent).norm(dim=-1) + (widest - half_width[rows])[:, None]
         inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
         index = (cells[..., 1] * width + cells[..., 0])[inside].long()
         value, source = value[inside], rows[:, None].expand_as(value)[inside]
         distance.scatter_reduce_(0, index, value, "amin")
         closest = value == distance[index]
         nearest[index[closest]] = source[closest]
-    return Surface(origin, distance.view(1, 1, height, width), nearest.view(height, width))
+    road_distance = (distance - widest).clamp(max=MARGIN)
+    return Surface(origin, road_distance.view(1, 1, height, width), nearest.view(height, width))
 
 
 def sample(raster: Tensor, origin: Tensor, positions: Tensor, mode: str = "bilinear") -> Tensor:
