@@ -36,7 +36,9 @@ class Town(nn.Module):
 
     Args:
         name: the name that episodes and reports use.
-        network: a highway-env network whose lanes carry a ``manoeuvre`` (:class:`~ldrl.subtasks.SubTask`).
+        network: a highway-env network whose lanes carry a ``manoeuvre`` (:class:`~ldrl.subtasks.SubTask`). Those of
+            junctions may carry ``options``, the manoeuvres that the road offers which they come from; without, these
+            are the ones that the lane before offers.
 
     Attributes:
         lane_length: ``[L]`` float32, m.
@@ -44,6 +46,7 @@ class Town(nn.Module):
         lane_successors: ``[L, S]`` int64, padded by repeating the first successor.
         lane_successor_count: ``[L]`` int64.
         lane_predecessor: ``[L]`` int64, one lane that leads into the lane.
+        lane_options: for each lane of a junction what its road of entry offers there; empty for other lanes.
         lane_to_junction: ``[L]`` float32, from the lane's end to the entry of the next junction, m.
         road_distance: ``[1, 1, H, W]`` float32, see :class:`~ldrl.towns.surface.Surface`.
         lane_direction: ``[1, 2, H, W]`` float32, unit vector along the nearest lane on the road outside junctions,
@@ -85,6 +88,7 @@ class Town(nn.Module):
         lanes = [network.get_lane(index) for index in self.lane_indices]
         self._register_lanes(lanes)
         self._register_links()
+        self.lane_options = [self._options(i, lane) for i, lane in enumerate(lanes)]
         self._register_surface(lanes)
 
     @classmethod
@@ -135,6 +139,11 @@ class Town(nn.Module):
         self._buffer("lane_successor_count", [len(row) for row in successors])
         self._buffer("lane_predecessor", predecessor)
         self._buffer("lane_to_junction", [self._distance_to_junction(i) for i in range(len(successors))])
+
+    def _options(self, i: int, lane: AbstractLane) -> frozenset[SubTask]:
+        """What can be done at the junction that a lane belongs to by cars that come the same way."""
+        beside = self.successors(int(self.lane_predecessor[i])) if lane.manoeuvre != SubTask.LANEFOLLOW else []
+        return getattr(lane, "options", frozenset(SubTask(int(self.lane_manoeuvre[k])) for k in beside))
 
     def _distance_to_junction(self, lane: int) -> float:
         """Arc length from the end of ``lane`` to the next junction; infinite on a loop without one."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -24,6 +25,7 @@ _ENDS: dict[Contact, str] = {"start": "predecessor", "end": "successor"}
 
 
 def check_version(header: Element) -> None:
+    """Refuse versions that cannot be read."""
     version = header.get("revMajor", "?"), header.get("revMinor", "?")
     if not all(part.isdecimal() for part in version) or tuple(map(int, version)) not in VERSIONS:
         raise ValueError(f"it is OpenDRIVE {version[0]:.9}.{version[1]:.9}; 1.4 to 1.7 can be read, so convert it")
@@ -54,20 +56,22 @@ def _records(elements: list[Element], start: str) -> np.ndarray:
 
 
 def road(element: Element, name: str) -> Road:
+    """The record of a ``<road>`` of that id."""
     length = _length(element, "length")
     if length == 0:
         raise ValueError("its length is 0; give its length in metres")
     junction = element.get("junction", "-1")
     links = {end: _link(e) for end, tag in _ENDS.items() if (e := element.find(f"link/{tag}")) is not None}
-    road = Road(name, length, None if junction in ("-1", "") else junction, links)
+    bare = Road(name, length, None if junction in ("-1", "") else junction, links)
     if not any(lane.get("type") in DRIVEN for lane in element.iterfind("lanes/laneSection/*/lane")):
-        return road
+        return bare
     rule = element.get("rule", "RHT")
     if rule not in ("RHT", "LHT"):
         raise ValueError(f"its traffic rule is {rule:.40}; give RHT or LHT")
     offsets = _records(element.findall("lanes/laneOffset"), "s")
     sections = _sections(element.findall("lanes/laneSection"), length)
-    return Road(name, length, road.junction, links, rule == "RHT", _plan_view(element, length), offsets, sections)
+    line = _plan_view(element, length)
+    return replace(bare, right_hand=rule == "RHT", geometries=line, offsets=offsets, sections=sections)
 
 
 def _contact(element: Element) -> Contact:
@@ -93,7 +97,7 @@ def _plan_view(road: Element, length: float) -> tuple[Geometry, ...]:
             reach = f"its <geometry> at s={geometry.s:g} reaches {geometry.s + geometry.curve.length:g}"
             raise ValueError(f"{reach} m, but the next one, or the road's end, is at {end:g} m; make them meet")
         if following is not None and (gap := _gap(geometry, following)) > MAX_GAP:
-            raise ValueError(f"its <geometry> at s={end:g} starts {gap:.1f} m from where the one before ends; join them")
+            raise ValueError(f"its <geometry> at s={end:g} is {gap:.1f} m from the end of the one before; join them")
     return tuple(geometries)
 
 
@@ -135,7 +139,7 @@ def _param_poly3(element: Element, length: float) -> Parametric:
     return Parametric(length, u, v, 1.0 if span == "normalized" else length)
 
 
-_CURVES = {
+_CURVES: Mapping[str, Callable[[Element, float], Clothoid | Parametric]] = {
     "line": lambda _, length: Clothoid(length),
     "arc": _arc,
     "spiral": _spiral,
@@ -150,7 +154,8 @@ def _sections(elements: list[Element], length: float) -> tuple[Section, ...]:
     elements = sorted(elements, key=lambda element: _length(element, "s"))
     starts = [_length(element, "s") for element in elements]
     if starts[0] > 0 or starts[-1] > length:
-        raise ValueError(f"its lane sections start at {starts[0]:g} to {starts[-1]:g} m; let them start at 0 to {length:g}")
+        found = f"its lane sections start at {starts[0]:g} to {starts[-1]:g} m"
+        raise ValueError(f"{found}; let the first start at 0 and the last before {length:g}")
     ends = [*starts[1:], length]
     return tuple(Section(s, end, _lanes(e)) for s, end, e in zip(starts, ends, elements, strict=True))
 
@@ -170,6 +175,7 @@ def _lanes(section: Element) -> dict[int, LaneRecord]:
 
 
 def connection(element: Element) -> Connection:
+    """The record of a ``<connection>`` of a junction."""
     connecting = element.get("connectingRoad", element.get("linkedRoad", ""))
     lanes = tuple((int(_number(e, "from")), int(_number(e, "to"))) for e in element.iterfind("laneLink"))
     return Connection(element.get("incomingRoad", ""), connecting, _contact(element), lanes)

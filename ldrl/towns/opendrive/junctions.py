@@ -4,46 +4,63 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-
-import numpy as np
+from typing import NamedTuple
 
 from ldrl.subtasks import SubTask
 from ldrl.towns.opendrive.graph import Chain, Graph
 from ldrl.towns.opendrive.lanes import LaneKey, LanePiece, forward
 from ldrl.towns.opendrive.records import OpenDrive
 
-__all__ = ["classify", "leave_out_u_turns"]
+__all__ = ["FOLLOW", "Task", "classify", "leave_out_u_turns"]
 
 STRAIGHT_ON = math.radians(30)
 """A junction lane that turns less leads straight on."""
+U_TURN = math.radians(150)
+"""One that turns more is a U-turn."""
 
 Way = tuple[str, bool]
 """A road, and whether it is driven forward."""
 
 
-def leave_out_u_turns(graph: Graph[Chain], source: OpenDrive) -> None:
-    """Remove junction lanes back onto the road that they come from, where that road has another way on."""
-    for (_, road, ahead), chains in _entries(graph, source).items():
-        back = [chain for chain in chains if _way(source, graph.after[chain][0][0]) == (road, not ahead)]
+class Task(NamedTuple):
+    """What is done on a lane, and all that its road of entry offers, on whichever lane."""
+
+    manoeuvre: SubTask
+    options: frozenset[SubTask]
+
+
+FOLLOW = Task(SubTask.LANEFOLLOW, frozenset())
+
+
+def leave_out_u_turns(graph: Graph[Chain], source: OpenDrive, pieces: dict[LaneKey, LanePiece]) -> None:
+    """Remove junction lanes that turn by more than 150 degrees, where their road of entry has another way on.
+
+    No keyword asks for them, and as lefts they would hide the street on the left.
+    """
+    for chains in _entries(graph, source).values():
+        back = [chain for chain in chains if abs(_turn([pieces[key] for key in chain])[0]) > U_TURN]
         if len(back) < len(chains):
             for chain in back:
                 graph.remove(chain)
 
 
-def classify(graph: Graph[Chain], source: OpenDrive, pieces: dict[LaneKey, LanePiece]) -> dict[Chain, SubTask]:
-    """The manoeuvre of every lane.
+def classify(graph: Graph[Chain], source: OpenDrive, pieces: dict[LaneKey, LanePiece]) -> dict[LaneKey, Task]:
+    """What is done on each lane of a junction where there is a choice.
 
-    A lane outside junctions is ``LANEFOLLOW``; so is one inside if the road that it comes from leads to one road only,
-    because there is nothing to say about it, as at a corner. Else a lane that turns by less than 30 degrees is
-    ``STRAIGHT``, others ``LEFT`` or ``RIGHT``. Where several roads lie straight on, the straightest is ``STRAIGHT``
-    and the others are ``LEFT`` or ``RIGHT``, on whichever side of it they lie.
+    Where all lanes of a road lead to one other road, there is nothing to say about it, as at a corner: they are
+    ``LANEFOLLOW``, like lanes outside junctions. Else a lane that turns by less than 30 degrees is ``STRAIGHT``, others
+    are ``LEFT`` or ``RIGHT``. Where several roads lie straight on, the straightest is ``STRAIGHT`` and the others are
+    ``LEFT`` or ``RIGHT``, on whichever side of it they lie.
 
     Args:
         graph: all lanes, each with one before and one after it.
         source: the file.
         pieces: samples of its lanes.
+
+    Returns:
+        The tasks of all lanes that are not ``LANEFOLLOW``.
     """
-    manoeuvres = dict.fromkeys(graph.after, SubTask.LANEFOLLOW)
+    tasks: dict[LaneKey, Task] = {}
     for chains in _entries(graph, source).values():
         ways = {chain: _way(source, graph.after[chain][0][0]) for chain in chains}
         if len(set(ways.values())) == 1:
@@ -51,12 +68,15 @@ def classify(graph: Graph[Chain], source: OpenDrive, pieces: dict[LaneKey, LaneP
         turns = {chain: _turn([pieces[key] for key in chain]) for chain in chains}
         straight = [chain for chain in chains if abs(turns[chain][0]) < STRAIGHT_ON]
         straightest = min(straight, key=lambda chain: sum(map(abs, turns[chain])), default=None)
+        manoeuvres = {}
         for chain in chains:
             side = turns[chain][0]
             if straightest is not None and chain in straight:
                 side = 0.0 if ways[chain] == ways[straightest] else turns[chain][1] - turns[straightest][1]
             manoeuvres[chain] = SubTask.STRAIGHT if side == 0 else SubTask.RIGHT if side > 0 else SubTask.LEFT
-    return manoeuvres
+        options = frozenset(manoeuvres.values())
+        tasks |= {key: Task(manoeuvres[chain], options) for chain in chains for key in chain}
+    return tasks
 
 
 def _entries(graph: Graph[Chain], source: OpenDrive) -> dict[tuple[str, str, bool], list[Chain]]:

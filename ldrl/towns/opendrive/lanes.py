@@ -94,8 +94,8 @@ def _sample_section(
     offset = cubic(road.offsets, s)
     centres, widths = _cross_section(section, offset, s)
     pieces = {}
-    for lane, centre in centres.items():
-        width = widths[lane]
+    for lane in centres:
+        centre, width = centres[lane], widths[lane]
         if section.lanes[lane].type not in DRIVEN or width.max() <= NARROW:
             continue
         opens, closes = width[0] < NARROW, width[-1] < NARROW
@@ -111,7 +111,7 @@ def _sample_section(
 def _cross_section(
     section: Section, offset: np.ndarray, s: np.ndarray
 ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """t of the centres, and widths, of all lanes by id."""
+    """By id, the t of every lane's centre and its width, m."""
     centres, widths = {}, {}
     for side in (1, -1):
         inner = offset

@@ -50,13 +50,7 @@ def link_lanes(source: OpenDrive, pieces: dict[LaneKey, LanePiece]) -> tuple[Gra
     _join_junctions(source, graph, broken)
     _pass_over(graph, pieces)
     _cut_gaps(graph, pieces, broken)
-    for key, piece in pieces.items():
-        if piece.opens_beside is not None and not graph.before[key]:
-            for preceding in graph.before[piece.opens_beside]:
-                graph.join(preceding, key)
-        if piece.closes_beside is not None and not graph.after[key]:
-            for following in graph.after[piece.closes_beside]:
-                graph.join(key, following)
+    _share_beside(graph, pieces)
     return graph, broken
 
 
@@ -137,3 +131,13 @@ def _cut_gaps(graph: Graph[LaneKey], pieces: dict[LaneKey, LanePiece], broken: l
             if gap > MAX_GAP:
                 graph.cut(a, b)
                 broken.append(f"{a} ends {gap:.1f} m from {b}, which is to follow it")
+
+
+def _share_beside(graph: Graph[LaneKey], pieces: dict[LaneKey, LanePiece]) -> None:
+    for key, piece in pieces.items():
+        if piece.opens_beside is not None and not graph.before[key]:
+            for preceding in graph.before[piece.opens_beside]:
+                graph.join(preceding, key)
+        if piece.closes_beside is not None and not graph.after[key]:
+            for following in graph.after[piece.closes_beside]:
+                graph.join(key, following)

@@ -9,18 +9,18 @@ import numpy as np
 from highway_env.road.lane import LineType
 from highway_env.road.road import RoadNetwork
 
-from ldrl.subtasks import SubTask
 from ldrl.towns.opendrive.graph import Chain, Graph, chains, merge
-from ldrl.towns.opendrive.junctions import classify, leave_out_u_turns
+from ldrl.towns.opendrive.junctions import FOLLOW, Task, classify, leave_out_u_turns
 from ldrl.towns.opendrive.lanes import LaneKey, LanePiece, sample_road
 from ldrl.towns.opendrive.links import link_lanes
 from ldrl.towns.opendrive.reader import read_opendrive
+from ldrl.towns.opendrive.records import OpenDrive
 from ldrl.towns.polyline import PolylineLane
 
 __all__ = ["load_network"]
 
-MAX_TOTAL = 300_000.0
-"""Length of all lanes, m."""
+MAX_TOTAL = 1_000_000.0
+"""Length of all lanes of whatever type, m."""
 MAX_LANES = 32_767
 """What a route window of 16-bit integers can name."""
 NEAR = 0.1
@@ -54,27 +54,39 @@ def load_network(path: str | Path) -> RoadNetwork:
     """
     source = read_opendrive(path)
     try:
-        pieces = {key: piece for road in source.roads.values() if road.sections for key, piece in sample_road(road).items()}
+        pieces = _sample(source)
+        links, problems = link_lanes(source, pieces)
+        junction_of = {key: source.roads[key.road].junction for key in pieces}
+        graph = merge(chains(links), lambda a, b: junction_of[a[-1]] == junction_of[b[0]])
+        leave_out_u_turns(graph, source, pieces)
+        left_out = _leave_out_dead_ends(graph)
+        problems += [f"nothing leads on from, or to, {' and '.join(map(str, chain))}" for chain in left_out]
+        more = len(problems) - MOST_NAMED
+        summary = "; ".join(problems[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+        if not graph.after:
+            raise ValueError(f"no lane leads on for ever; join its roads into loops: {summary}")
+        tasks = classify(graph, source, pieces)
+        graph = merge(graph, lambda a, b: a[-1] not in tasks and b[0] not in tasks)
+        network = _network(graph, pieces, tasks)
     except ValueError as error:
         raise ValueError(f"map {path}: {error}") from None
-    if not pieces:
-        raise ValueError(f"map {path} has no lane for cars; give one with lanes of type 'driving'")
-    links, problems = link_lanes(source, pieces)
-    junction_of = {key: source.roads[key.road].junction for key in pieces}
-    graph = merge(chains(links), lambda a, b: junction_of[a[-1]] == junction_of[b[0]])
-    leave_out_u_turns(graph, source)
-    problems += [f"no way on from, or to, {' and '.join(map(str, chain))}" for chain in _leave_out_dead_ends(graph)]
-    summary = "; ".join(problems[:MOST_NAMED]) + f"; and {len(problems) - MOST_NAMED} more" * (
-        len(problems) > MOST_NAMED
-    )
-    if not graph.after:
-        raise ValueError(f"map {path}: no lane leads on for ever; join its roads into loops: {summary}")
     if problems:
-        warnings.warn(f"map {path}: what cannot be driven for ever is left out: {summary}", stacklevel=3)
-    manoeuvres = classify(graph, source, pieces)
-    following = {key for chain, manoeuvre in manoeuvres.items() if manoeuvre == SubTask.LANEFOLLOW for key in chain}
-    graph = merge(graph, lambda a, b: a[-1] in following and b[0] in following)
-    return _network(graph, pieces, {chain[0]: manoeuvre for chain, manoeuvre in manoeuvres.items()})
+        warnings.warn(f"map {path}: left out what cannot be driven for ever: {summary}", stacklevel=3)
+    return network
+
+
+def _sample(source: OpenDrive) -> dict[LaneKey, LanePiece]:
+    """Samples of all lanes for cars."""
+    roads = [road for road in source.roads.values() if road.sections]
+    total = sum((section.end - section.start) * len(section.lanes) for road in roads for section in road.sections)
+    if total > MAX_TOTAL:
+        raise ValueError(
+            f"its lanes are {total / 1000:.0f} km long, the limit is {MAX_TOTAL / 1000:g}; cut it into parts"
+        )
+    pieces = {key: piece for road in roads for key, piece in sample_road(road).items()}
+    if not pieces:
+        raise ValueError("it has no lane for cars; give one with lanes of type 'driving'")
+    return pieces
 
 
 def _leave_out_dead_ends(graph: Graph[Chain]) -> list[Chain]:
@@ -90,10 +102,8 @@ def _leave_out_dead_ends(graph: Graph[Chain]) -> list[Chain]:
     return removed
 
 
-def _network(
-    graph: Graph[Chain], pieces: dict[LaneKey, LanePiece], manoeuvres: dict[LaneKey, SubTask]
-) -> RoadNetwork:
-    """A network in which a node is where the lanes end that the same lanes follow.
+def _network(graph: Graph[Chain], pieces: dict[LaneKey, LanePiece], tasks: dict[LaneKey, Task]) -> RoadNetwork:
+    """A network in which a node is where lanes end that the same lanes follow.
 
     A lane that follows at several nodes, because it shares only some of them with others, is an edge from each.
     """
@@ -102,28 +112,24 @@ def _network(
     for chain, after in graph.after.items():
         nodes.setdefault(frozenset(after), f"end of {chain[-1]}")
     for chain, before in graph.before.items():
-        lane = _lane([pieces[key] for key in chain], manoeuvres[chain[0]])
+        task = tasks.get(chain[0], FOLLOW)
+        lane = _lane([pieces[key] for key in chain], task)
         for start in dict.fromkeys(nodes[frozenset(graph.after[preceding])] for preceding in before):
             network.add_lane(start, nodes[frozenset(graph.after[chain])], lane)
+    if len(network.lanes_list()) > MAX_LANES:
+        raise ValueError(f"it has {len(network.lanes_list())} lanes, the limit is {MAX_LANES}; cut it into parts")
     return network
 
 
-def _lane(pieces: list[LanePiece], manoeuvre: SubTask) -> PolylineLane:
+def _lane(pieces: list[LanePiece], task: Task) -> PolylineLane:
     """One lane of pieces that follow each other."""
-    kept = [
-        slice(0, -1 if np.hypot(*(after.points[0] - piece.points[-1])) < NEAR else None)
-        for piece, after in zip(pieces[:-1], pieces[1:], strict=True)
-    ] + [slice(None)]
-    samples = [
-        np.concatenate([values[part] for values, part in zip(each, kept, strict=True)])
-        for each in (
-            [piece.points for piece in pieces],
-            [piece.headings for piece in pieces],
-            [piece.widths for piece in pieces],
-        )
-    ]
-    on_street = manoeuvre == SubTask.LANEFOLLOW
+    samples = np.concatenate([np.column_stack((piece.points, piece.headings, piece.widths)) for piece in pieces])
+    # A step between two pieces that is too short to have a direction; the lane's two ends stay.
+    steps = np.hypot(*np.diff(samples[:, :2], axis=0).T)
+    joints = np.cumsum([len(piece.points) for piece in pieces[:-1]], dtype=int) - 1
+    samples = np.delete(samples, joints[steps[joints] < NEAR], axis=0)
+    on_street = task is FOLLOW
     lines = (LineType.STRIPED, LineType.CONTINUOUS) if on_street else (LineType.NONE, LineType.NONE)
-    lane = PolylineLane(*samples, line_types=lines)
-    lane.manoeuvre = manoeuvre
+    lane = PolylineLane(samples[:, :2], samples[:, 2], samples[:, 3], line_types=lines)
+    lane.manoeuvre, lane.options = task
     return lane

@@ -18,10 +18,13 @@ __all__ = ["read_opendrive"]
 
 MAX_BYTES = 50_000_000
 """Larger files are refused, bytes."""
-WANTED = frozenset(
-    "OpenDRIVE header road link predecessor successor planView geometry line arc spiral poly3 paramPoly3 lanes "
-    "laneOffset laneSection left right lane width border junction connection laneLink".split()
-)
+MAX_TOTAL = 1_000_000.0
+"""Length of all roads, m."""
+WANTED = {
+    *("OpenDRIVE", "header", "road", "link", "predecessor", "successor", "planView", "geometry", "line", "arc"),
+    *("spiral", "poly3", "paramPoly3", "lanes", "laneOffset", "laneSection", "left", "right", "lane", "width"),
+    *("border", "junction", "connection", "laneLink"),
+}
 """The elements that are kept; all others are skipped with what is in them."""
 
 
@@ -68,6 +71,7 @@ class _Reader:
         self._open: list[Element] = []
         self._skipped = 0
         self._version_known = False
+        self._total = 0.0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         if not self._open and tag != "OpenDRIVE":
@@ -100,6 +104,11 @@ class _Reader:
                 raise ValueError("give it an id of its own")
             if element.tag == "road":
                 self.roads[name] = elements.road(element, name)
+                self._total += self.roads[name].length
+                if self._total > MAX_TOTAL:
+                    raise ValueError(
+                        f"roads are longer than {MAX_TOTAL / 1000:g} km up to here; cut the map into parts"
+                    )
             elif element.tag == "junction":
                 self.junctions[name] = tuple(map(elements.connection, element.iter("connection")))
         except ValueError as error:

@@ -17,7 +17,7 @@ from ldrl.towns.opendrive.geometry import Geometry
 __all__ = ["DRIVEN", "Connection", "Contact", "LaneRecord", "Link", "OpenDrive", "Road", "Section"]
 
 DRIVEN = frozenset(
-    "driving entry exit onRamp offRamp connectingRamp slipLane mwyEntry mwyExit".split()  # the last two: until 1.4
+    ("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane", "mwyEntry", "mwyExit")
 )
 """Lane types for cars that have one direction. Not among them: ``bidirectional``, lanes for buses, taxis or parking."""
 
