@@ -46,6 +46,7 @@ class PolylineLane(AbstractLane):
     ) -> None:
         super().__init__()
         self.points = np.asarray(points, np.float64)
+        self._x, self._y = self.points.T.copy()  # contiguous, for np.interp
         self.headings = np.unwrap(np.asarray(headings, np.float64))
         self.widths = np.asarray(widths, np.float64)
         self.stations = np.concatenate(([0.0], np.hypot(*np.diff(self.points, axis=0).T).cumsum()))
@@ -57,8 +58,8 @@ class PolylineLane(AbstractLane):
 
     def position(self, longitudinal: float, lateral: float) -> np.ndarray:
         """The point at arc length ``longitudinal``, ``lateral`` to the right of the centre line, m."""
-        x = np.interp(longitudinal, self.stations, self.points[:, 0])
-        y = np.interp(longitudinal, self.stations, self.points[:, 1])
+        x = np.interp(longitudinal, self.stations, self._x)
+        y = np.interp(longitudinal, self.stations, self._y)
         heading = self.heading_at(longitudinal)
         beyond = longitudinal - min(max(longitudinal, 0.0), self.length)
         cos, sin = np.cos(heading), np.sin(heading)
@@ -74,8 +75,7 @@ class PolylineLane(AbstractLane):
 
     def local_coordinates(self, position: np.ndarray) -> tuple[float, float]:
         """Arc length of the nearest point of the centre line, and the distance to its right, m."""
-        offset = self.points - position
-        nearest = int((offset * offset).sum(1).argmin())
+        nearest = int(np.argmin((self._x - position[0]) ** 2 + (self._y - position[1]) ** 2))
         longitudinal = float(self.stations[nearest])
         for _ in range(2):  # along the tangent: first of the nearest sample, then of the point found so
             heading = self.heading_at(longitudinal)

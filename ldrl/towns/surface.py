@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-__all__ = ["CELL", "MARGIN", "Surface", "rasterise", "sample"]
+__all__ = ["CELL", "MARGIN", "Surface", "raster_size", "rasterise", "sample"]
 
 CELL = 0.5
 """Edge of a raster cell, m."""
@@ -34,6 +35,22 @@ class Surface(NamedTuple):
     nearest_point: Tensor
 
 
+def raster_size(extent: Sequence[float]) -> tuple[int, int]:
+    """Columns and rows of the rasters over an area.
+
+    Args:
+        extent: from west to east and from north to south, m.
+
+    Raises:
+        ValueError: there would be more than 16 million cells.
+    """
+    width, height = (math.ceil(size / CELL) + 1 for size in extent)
+    if width * height > MAX_CELLS:
+        area = f"{width * CELL / 1000:.1f} by {height * CELL / 1000:.1f} km"
+        raise ValueError(f"the map covers {area}; cut it to an area of {MAX_CELLS * CELL**2 / 1e6:g} square kilometres")
+    return width, height
+
+
 def rasterise(points: Tensor, headings: Tensor, half_width: Tensor, spacing: float) -> Surface:
     """Rasterise the union of bands around centre lines.
 
@@ -53,10 +70,7 @@ def rasterise(points: Tensor, headings: Tensor, half_width: Tensor, spacing: flo
     widest = float(half_width.max())
     border = widest + MARGIN
     origin = points.amin(0) - border
-    width, height = ((points.amax(0) + border - origin) / CELL).ceil().int().add(1).tolist()
-    if height * width > MAX_CELLS:
-        size = f"{width * CELL / 1000:.1f} by {height * CELL / 1000:.1f} km"
-        raise ValueError(f"the map covers {size}; cut it to an area of {MAX_CELLS * CELL**2 / 1e6:g} square kilometres")
+    width, height = raster_size((points.amax(0) + border - origin).tolist())
     reach = math.ceil(border / CELL)
     steps = torch.arange(-reach, reach + 1)
     window = torch.cartesian_prod(steps, steps).flip(-1)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ldrl.subtasks import SubTask
 from ldrl.towns import opendrive, surface
-from ldrl.towns.layout import load_layout
+from ldrl.towns.layout import LAYOUTS, load_layout
 
 __all__ = ["ROUTE_LANES", "Town"]
 
@@ -92,7 +92,7 @@ class Town(nn.Module):
         self._register_surface(lanes)
 
     @classmethod
-    def load(cls, name: str) -> Town:
+    def load(cls, name: str | Path) -> Town:
         """A built-in town, or the map in an OpenDRIVE file.
 
         Args:
@@ -103,8 +103,11 @@ class Town(nn.Module):
             FileNotFoundError: there is no such file.
             ValueError: no town has that name, or no town can be made of the file.
         """
+        name = str(name)
         if name.endswith(".xodr"):
             return cls(Path(name).name, opendrive.load_network(name))
+        if name not in LAYOUTS:
+            raise ValueError(f"unknown town {name!r}; use one of {', '.join(LAYOUTS)}, or the path of a .xodr file")
         return cls(name, load_layout(name).network())
 
     def _buffer(self, name: str, value: Tensor | np.ndarray | list) -> None:

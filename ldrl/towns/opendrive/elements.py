@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from xml.etree.ElementTree import Element
 
@@ -18,6 +18,8 @@ MAX_LENGTH = 100_000.0
 """Longest road, and farthest from the origin that one may lie: float32 coordinates are 1 cm apart there, m."""
 MAX_CURVATURE = 10.0
 """1/m."""
+MAX_COEFFICIENT = 1e6
+"""Of a polynomial; so none overflows."""
 MAX_GAP = 1.0
 """How far a piece of a reference line may start from where the one before ends, m."""
 VERSIONS = ((1, 4), (1, 5), (1, 6), (1, 7))
@@ -51,7 +53,7 @@ def _length(element: Element, name: str, default: float | None = None) -> float:
 
 
 def _records(elements: list[Element], start: str) -> np.ndarray:
-    rows = [[_length(e, start, 0.0), *(_number(e, name, 0.0) for name in "abcd")] for e in elements]
+    rows = [[_length(e, start, 0.0), *(_number(e, name, 0.0, MAX_COEFFICIENT) for name in "abcd")] for e in elements]
     return np.array(sorted(rows, key=lambda row: row[0]), np.float64).reshape(-1, 5)
 
 
@@ -127,15 +129,19 @@ def _spiral(element: Element, length: float) -> Clothoid:
     return Clothoid(length, *(_number(element, name, largest=MAX_CURVATURE) for name in ("curvStart", "curvEnd")))
 
 
+def _coefficients(element: Element, names: Iterable[str]) -> list[float]:
+    return [_number(element, name, largest=MAX_COEFFICIENT) for name in names]
+
+
 def _poly3(element: Element, length: float) -> Parametric:
-    return Parametric(length, (0.0, 1.0), [_number(element, name) for name in "abcd"], None)
+    return Parametric(length, (0.0, 1.0), _coefficients(element, "abcd"), None)
 
 
 def _param_poly3(element: Element, length: float) -> Parametric:
     span = element.get("pRange", "normalized")
     if span not in ("normalized", "arcLength"):
         raise ValueError(f"<paramPoly3> has pRange={span:.40}; give normalized or arcLength")
-    u, v = ([_number(element, f"{name}{axis}") for name in "abcd"] for axis in "UV")
+    u, v = (_coefficients(element, [f"{name}{axis}" for name in "abcd"]) for axis in "UV")
     return Parametric(length, u, v, 1.0 if span == "normalized" else length)
 
 

@@ -75,7 +75,7 @@ class Parametric:
         """Poses.
 
         Raises:
-            ValueError: the curve has no length.
+            ValueError: the curve stands still somewhere.
         """
         steps = math.ceil(self.length / PARAMETER_STEP) + 32
         table = np.linspace(0, self.length if self.last is None else self.last, steps)
@@ -83,8 +83,8 @@ class Parametric:
         slopes = [np.polynomial.polynomial.polyder(coefficients) for coefficients in (self.u, self.v)]
         speed = np.hypot(*(np.polynomial.polynomial.polyval(nodes, slope) for slope in slopes))
         arc = np.concatenate(([0.0], (speed * WEIGHTS / 2).sum(1) * np.diff(table))).cumsum()
-        if not (np.diff(arc) > 0).all() or not math.isfinite(arc[-1]):
-            raise ValueError("a polynomial of its planView stands still or runs off; check its coefficients")
+        if not (np.diff(arc) > 0).all():
+            raise ValueError("a polynomial of its planView stands still; check its coefficients")
         p = np.interp(u * (1.0 if self.last is None else arc[-1] / self.length), arc, table)
         x, y = (np.polynomial.polynomial.polyval(p, coefficients) for coefficients in (self.u, self.v))
         dx, dy = (np.polynomial.polynomial.polyval(p, slope) for slope in slopes)

@@ -16,6 +16,7 @@ from ldrl.towns.opendrive.links import link_lanes
 from ldrl.towns.opendrive.reader import read_opendrive
 from ldrl.towns.opendrive.records import OpenDrive
 from ldrl.towns.polyline import PolylineLane
+from ldrl.towns.surface import raster_size
 
 __all__ = ["load_network"]
 
@@ -86,6 +87,8 @@ def _sample(source: OpenDrive) -> dict[LaneKey, LanePiece]:
     pieces = {key: piece for road in roads for key, piece in sample_road(road).items()}
     if not pieces:
         raise ValueError("it has no lane for cars; give one with lanes of type 'driving'")
+    corners = np.array([(piece.points.min(0), piece.points.max(0)) for piece in pieces.values()])
+    raster_size(np.ptp(corners.reshape(-1, 2), axis=0))  # sooner than after all other work
     return pieces
 
 
