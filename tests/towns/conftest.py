@@ -62,7 +62,7 @@ def junction(number, *connections):
 def opendrive(*elements, version="1.4"):
     major, minor = version.split(".")
     header = f'<header revMajor="{major}" revMinor="{minor}" north="0" south="0" east="0" west="0"/>'
-    return f'<?xml version="1.0"?><OpenDRIVE>{header}{"".join(elements)}</OpenDRIVE>'
+    return "\n".join(['<?xml version="1.0"?>', "<OpenDRIVE>", header, *elements, "</OpenDRIVE>", ""])
 
 
 def straight(number, x, y, hdg, length, *lanes, **options):
