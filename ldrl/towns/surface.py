@@ -17,7 +17,7 @@ CELL = 0.5
 MARGIN = 8.0
 """How far the rasters reach beyond the edge of the road, and the largest distance they tell, m."""
 MAX_CELLS = 16_000_000
-"""Largest raster: 2 by 2 km. A town of this size takes 0.2 GB, and 0.6 GB while it is made."""
+"""Largest raster: 2 by 2 km. A town of this size takes 0.2 GB, and 0.7 GB while it is made."""
 
 
 class Surface(NamedTuple):

@@ -159,9 +159,9 @@ class Town(nn.Module):
         return math.inf
 
     def _register_surface(self, lanes: list) -> None:
-        half_widths = [lane.width_at(s) / 2 + SHOULDER for lane in lanes for s in _stations(lane)]
+        widths = torch.tensor([lane.width_at(s) for lane in lanes for s in _stations(lane)], dtype=torch.float32)
         try:
-            rasters = surface.rasterise(self.points, self.headings, torch.tensor(half_widths), LANE_SPACING)
+            rasters = surface.rasterise(self.points, self.headings, widths / 2 + SHOULDER, LANE_SPACING)
         except ValueError as error:
             raise ValueError(f"town {self.name!r}: {error}") from None
         lane_of_point = torch.searchsorted(self.lane_first, torch.arange(len(self.points)), right=True) - 1

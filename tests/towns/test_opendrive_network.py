@@ -241,6 +241,16 @@ def test_a_junction_with_one_way_on_is_no_junction(xodr, save):
     assert lane.length == pytest.approx(200 + 2 * math.pi * 22, abs=0.1)
 
 
+def test_a_direct_junction_joins_roads_without_a_connecting_one(xodr, save):
+    """OpenDRIVE 1.7: the oval's end joined with its start in a junction, by ``linkedRoad``."""
+    text = ring(xodr, start="junction 5", end="junction 5")
+    link = xodr.connection(1, 1, "start", (-1, -1)).replace("connectingRoad", "linkedRoad")
+    network = load_network(save(xodr.opendrive(text, xodr.junction(5, link), version="1.7")))
+    (lane,) = network.lanes_list()
+    assert lane.length == pytest.approx(200 + 2 * math.pi * 22, abs=0.1)
+    assert Town("oval", network).successors(0) == [0]
+
+
 @pytest.mark.parametrize(
     ("extra", "message"),
     [

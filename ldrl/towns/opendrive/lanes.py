@@ -99,7 +99,7 @@ def _sample_section(
         if section.lanes[lane].type not in DRIVEN or width.max() <= NARROW:
             continue
         opens, closes = width[0] < NARROW, width[-1] < NARROW
-        beside = _beside(road, lane, widths, section) if opens or closes else None
+        beside = _beside(lane, widths, section) if opens or closes else None
         if beside is not None:
             centre, width = _lead_over(centre, width, centres[beside], opens, closes)
         key = LaneKey(road.id, index, beside) if beside is not None else None
@@ -122,7 +122,7 @@ def _cross_section(
     return centres, widths
 
 
-def _beside(road: Road, lane: int, widths: dict[int, np.ndarray], section: Section) -> int | None:
+def _beside(lane: int, widths: dict[int, np.ndarray], section: Section) -> int | None:
     """The lane beside one that opens or closes: the inner neighbour, or else the outer one."""
     side = 1 if lane > 0 else -1
     for neighbour in (lane - side, lane + side):

@@ -37,7 +37,9 @@ def load_network(path: str | Path) -> RoadNetwork:
     ``offRamp``, ``connectingRamp`` and ``slipLane``; all others (``bidirectional`` too) are no road. Of these every
     lane is left out, repeatedly, that leads nowhere or that nothing leads to, because routes go on for ever and stay
     in their lanes. A warning names what is left out, and broken links. What is written wrongly, or cannot be read,
-    fails the load as a whole.
+    fails the load as a whole: so do lanes given by ``border``, ``singleSide`` sections and versions from 1.8.
+
+    *Which direction*: by each road's ``rule``, RHT or LHT, right-hand traffic without.
 
     *Which manoeuvre*: see :func:`~ldrl.towns.opendrive.junctions.classify`.
 
