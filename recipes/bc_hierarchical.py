@@ -131,7 +131,7 @@ def main(cfg: DictConfig) -> None:
     folder = Path("runs") / str(cfg.name)
     torch.manual_seed(cfg.seed)
     try:
-        towns = {name: Town.load(name) for name in (cfg.town, cfg.test_town)}
+        towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
         agent = HierarchicalAgent(AgentConfig(**OmegaConf.to_container(cfg.model))).to(cfg.device)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
@@ -162,7 +162,7 @@ def main(cfg: DictConfig) -> None:
     report = to_markdown(outcomes, title=folder.name, details=details)
     with replacing(folder / "report.md") as file:
         file.write_text(report, encoding="utf-8")
-    print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{cfg.town}.png.")
+    print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{next(iter(towns))}.png.")
 
 
 if __name__ == "__main__":

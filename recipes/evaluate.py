@@ -2,9 +2,11 @@
 
     python recipes/evaluate.py checkpoint=hierarchical-gs
     python recipes/evaluate.py checkpoint=runs/seed1 episodes=mine.jsonl out=mine.json
+    python recipes/evaluate.py checkpoint=hierarchical-gs episodes=maps/village.xodr
 
-`checkpoint` is a folder or the name of a checkpoint that ships with the package; `episodes` is a JSON-lines file or
-`builtin`; `out` is the JSON file to write, none by default.
+`checkpoint` is a folder or the name of a checkpoint that ships with the package; `episodes` is a JSON-lines file,
+`builtin` for the planner's episodes in the built-in towns, or an OpenDRIVE map for the planner's episodes there; `out`
+is the JSON file to write, none by default.
 """
 
 from __future__ import annotations
@@ -29,11 +31,15 @@ def main(cfg: DictConfig) -> None:
         if cfg.num_cars < 1:
             raise ValueError(f"num_cars is {cfg.num_cars}; give at least 1")
         agent = load_agent(str(cfg.checkpoint), cfg.device)
-        towns = {name: Town.load(name) for name in LAYOUTS}
-        if cfg.episodes == "builtin":
-            episodes = [episode for town in towns.values() for episode in builtin_episodes(town)]
+        source = str(cfg.episodes)
+        loaded = [Town.load(name) for name in ([source] if source.endswith(".xodr") else LAYOUTS)]
+        towns = {town.name: town for town in loaded}
+        if source == "builtin" or source.endswith(".xodr"):
+            episodes = [episode for town in loaded for episode in builtin_episodes(town)]
         else:
-            episodes = load_episodes(str(cfg.episodes), towns)
+            episodes = load_episodes(source, towns)
+        if not episodes:
+            raise ValueError(f"no keyword can be realised in {source}; give a map with junctions")
         if cfg.out is not None:
             check_writable(str(cfg.out))
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device

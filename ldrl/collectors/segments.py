@@ -59,11 +59,10 @@ def find_segments(town: Town, snippets: Snippets, lane: Tensor, max_junctions: i
     """
     found: dict[str, list[Segment]] = {name: [] for name in KEYWORDS}
     subtasks, drives = snippets.subtask.tolist(), snippets.drive_start.tolist()
-    options = _options(town)
     offered: list[frozenset[SubTask] | None] = []
     for subtask, start, end in zip(subtasks, snippets.start.tolist(), snippets.end.tolist(), strict=True):
         in_junction = [k for k in lane[start:end].unique().tolist() if int(town.lane_manoeuvre[k]) == subtask]
-        offered.append(options[in_junction[0]] if subtask != SubTask.LANEFOLLOW and in_junction else None)
+        offered.append(town.lane_options[in_junction[0]] if subtask != SubTask.LANEFOLLOW and in_junction else None)
     for first in range(len(subtasks)):
         if subtasks[first] != SubTask.LANEFOLLOW:
             continue
@@ -81,12 +80,6 @@ def find_segments(town: Town, snippets: Snippets, lane: Tensor, max_junctions: i
                 ):
                     found[keyword.name].append(Segment(tuple(range(first, last + 1))))
     return found
-
-
-def _options(town: Town) -> list[frozenset[SubTask]]:
-    """What the junction before or at each lane offers to a car that comes the same way."""
-    before = town.lane_predecessor.tolist()
-    return [frozenset(SubTask(int(town.lane_manoeuvre[k])) for k in town.successors(p)) for p in before]
 
 
 class BoundarySampler(DemonstrationSampler):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 from ldrl.language import KEYWORDS, Keyword, Sentences, Tokenizer
 from ldrl.towns import Route, Town, UnrealisableError, match_route, plan_routes
+from ldrl.towns.opendrive import load_network
 
 __all__ = ["Episode", "builtin_episodes", "load_episodes", "save_episodes"]
 
@@ -27,7 +28,7 @@ class Episode:
 
     Args:
         id: any string; reports return it unchanged.
-        town: name of the town.
+        town: name of the town; in a file, for a map that is not built in, the path of its ``.xodr`` file.
         keyword: what the instruction means.
         instruction: what the passenger says.
         start: x, y (m) and heading (rad).
@@ -109,9 +110,8 @@ def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout",
             continue
         for k, route in enumerate(routes):
             start = rng.uniform(0, min(START_BEFORE_JUNCTION, float(town.lane_length[route.lanes[0]])))
-            driven = Route(
-                town, route.lanes, float(town.lane_length[route.lanes[0]]) - start, rng.uniform(*END_BEHIND_JUNCTION)
-            )
+            end = min(rng.uniform(*END_BEHIND_JUNCTION), float(town.lane_length[route.lanes[-1]]))
+            driven = Route(town, route.lanes, float(town.lane_length[route.lanes[0]]) - start, end)
             poses = driven.poses().tolist()
             episodes.append(
                 Episode(
@@ -136,12 +136,14 @@ def save_episodes(episodes: Iterable[Episode], path: str | Path) -> None:
     Path(path).write_text("".join(json.dumps(asdict(episode)) + "\n" for episode in episodes), encoding="utf-8")
 
 
-def load_episodes(path: str | Path, towns: Mapping[str, Town] | None = None) -> list[Episode]:
+def load_episodes(path: str | Path, towns: dict[str, Town] | None = None) -> list[Episode]:
     """Read an episode file.
 
     Args:
         path: JSON lines, one episode each; blank lines are skipped.
-        towns: by name, to check every start and path against; None checks neither these nor the towns' names.
+        towns: by name, to check every start and path against; None checks neither these nor the towns' names. A town
+            that ends in ``.xodr`` is the path of a map, relative to the folder of the episode file or absolute: it is
+            loaded, and added here under the name that the episodes give it.
 
     Raises:
         ValueError: the file has no episode, or a line is broken, or its episode does not lie on the roads of its
@@ -159,15 +161,18 @@ def load_episodes(path: str | Path, towns: Mapping[str, Town] | None = None) -> 
         if not line.strip():
             continue
         try:
-            episodes.append(_parse(line, towns))
-        except ValueError as error:
+            episode = _parse(line)
+            if towns is not None:
+                episode.route(_town(episode.town, towns, Path(path).parent))
+        except (ValueError, FileNotFoundError) as error:
             raise ValueError(f"{path}, line {number}: {error}") from None
+        episodes.append(episode)
     if not episodes:
         raise ValueError(f"{path} has no episode; write one JSON object with {', '.join(FIELDS)} per line")
     return episodes
 
 
-def _parse(line: str, towns: Mapping[str, Town] | None) -> Episode:
+def _parse(line: str) -> Episode:
     try:
         record = json.loads(line)
     except json.JSONDecodeError as error:
@@ -177,9 +182,13 @@ def _parse(line: str, towns: Mapping[str, Town] | None) -> Episode:
     missing = [name for name in FIELDS if name not in record]
     if missing:
         raise ValueError(f"{', '.join(missing)} missing; an episode has {', '.join(FIELDS)}")
-    episode = Episode(**{name: record[name] for name in FIELDS})
-    if towns is not None:
-        if episode.town not in towns:
-            raise ValueError(f"unknown town {episode.town!r}; use one of {', '.join(towns)}")
-        episode.route(towns[episode.town])
-    return episode
+    return Episode(**{name: record[name] for name in FIELDS})
+
+
+def _town(name: str, towns: dict[str, Town], folder: Path) -> Town:
+    """The town that an episode names; a map is loaded when it is first named."""
+    if name not in towns:
+        if not name.endswith(".xodr"):
+            raise ValueError(f"unknown town {name!r}; use one of {', '.join(towns)}, or the path of a .xodr file")
+        towns[name] = Town(name, load_network(folder / name))
+    return towns[name]

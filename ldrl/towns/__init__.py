@@ -1,4 +1,4 @@
-"""Maps: street layouts, expanded into highway-env road networks, compiled into tensors; routes through them."""
+"""Maps: street layouts and OpenDRIVE files, as highway-env road networks, compiled into tensors; routes on them."""
 
 from ldrl.towns.layout import LAYOUTS, Layout, load_layout
 from ldrl.towns.matching import match_route

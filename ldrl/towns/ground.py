@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from ldrl.subtasks import SubTask
 from ldrl.towns.noise import TILE, flecks, hash_uniform, slabs, smooth_noise
@@ -75,17 +76,16 @@ class Ground:
 
         Args:
             green: ``[H, W]`` bool, cells of lots that are lawn.
-            inside: ``[4H, 4W]`` float32, positive where a wall stands.
+            inside: ``[H, W]`` float32, positive where a wall stands.
 
         Returns:
             ``[4H, 4W]`` uint8.
         """
         # A band of rows of cells at a time stays in the processor's cache.
         bands = torch.arange(len(self.nearest)).split(16)
-        codes = torch.cat([self._band(rows, green[rows][:, None, :, None]) for rows in bands])
-        return codes.masked_fill_(inside > 0, Material.WALL)
+        return torch.cat([self._band(rows, green[rows][:, None, :, None], inside) for rows in bands])
 
-    def _band(self, rows: Tensor, green: Tensor) -> Tensor:
+    def _band(self, rows: Tensor, green: Tensor, inside: Tensor) -> Tensor:
         """Materials ``[4R, 4W]`` of the texels in some rows of cells.
 
         All that is constant in a cell is ``[R, 1, W, 1]``, and what differs between its texels ``[R, 4, W, 4]``.
@@ -96,15 +96,21 @@ class Ground:
         cos, sin = (values[:, None, :, None] for values in (heading.cos(), heading.sin()))
         dx = (self.origin[0] + columns * CELL - self.points[point, 0])[:, None, :, None]
         dy = (self.origin[1] + rows[:, None] * CELL - self.points[point, 1])[:, None, :, None]
-        inside = (torch.arange(TEXELS) + 0.5) / TEXELS * CELL - CELL / 2
-        dx, dy = dx + inside, dy + inside.view(TEXELS, 1, 1)
+        texel = (torch.arange(TEXELS) + 0.5) / TEXELS * CELL - CELL / 2
+        dx, dy = dx + texel, dy + texel.view(TEXELS, 1, 1)
         along, across = dx * cos + dy * sin, dy * cos - dx * sin
         beyond = torch.hypot((along.abs() - 0.25).clamp_(min=0), across) - self.half_width[point][:, None, :, None]
         # Cells out of reach know no lane: what they call the nearest may be anywhere.
         beyond = torch.maximum(beyond, (self.beyond[rows] - CELL)[:, None, :, None])
         texture = [self._tiled(kind, rows, len(columns)) for kind in (smooth_noise, flecks, slabs)]
-        code = self._codes(point, along, across, beyond, texture, green)
-        return code.reshape(len(rows) * TEXELS, -1)
+        code = self._codes(point, along, across, beyond, texture, green).reshape(len(rows) * TEXELS, -1)
+        return code.masked_fill_(self._upsample(inside, rows) > 0, Material.WALL)
+
+    def _upsample(self, values: Tensor, rows: Tensor) -> Tensor:
+        """Values of texels between those of cells, ``[4R, 4W]``, for some rows of cells."""
+        around = torch.arange(int(rows[0]) - 1, int(rows[-1]) + 2).clamp(0, len(values) - 1)
+        fine = interpolate(values[around][None, None], scale_factor=TEXELS, mode="bilinear")
+        return fine[0, 0, TEXELS:-TEXELS]
 
     def _tiled(self, tile: Callable[[int], Tensor], rows: Tensor, columns: int) -> Tensor:
         """A square texture laid out over the texels of some rows of cells, ``[R, 4, W, 4]``."""

@@ -99,23 +99,39 @@ def plan_route(town: Town, command: Command, approach: int) -> Route:
         UnrealisableError: a junction on the way does not offer what is asked for, or the way loops forever.
     """
     lanes, state, seen = [approach], command.start, set()
-    while True:
-        following = town.successors(lanes[-1])
-        options = {SubTask(int(town.lane_manoeuvre[lane])): lane for lane in following}
-        if SubTask.LANEFOLLOW in options:
-            lanes.append(options[SubTask.LANEFOLLOW])
-            if command.done(state):
-                return Route(town, tuple(lanes), 0.0, float(town.lane_length[lanes[-1]]))
-            continue
-        if (lanes[-1], state) in seen:
+    while not command.done(state):
+        ways = _ways_on(town, lanes[-1])
+        if not ways or (lanes[-1], state) in seen:
             raise UnrealisableError(f"{command.name!r} from lane {approach} of {town.name!r} loops forever")
         seen.add((lanes[-1], state))
+        # What the passenger sees: a street on the left counts, even where this lane does not lead into it.
+        options = dict.fromkeys(option for way in ways.values() for option in town.lane_options[way[-1]])
         choice = command.step(state, options)
-        if choice is None:
-            offered = ", ".join(option.name.lower() for option in options)
+        if choice is None or choice[0] not in ways:
+            offered = ", ".join(option.name.lower() for option in ways)
             raise UnrealisableError(f"{command.name!r} meets a junction of {town.name!r} that offers only {offered}")
-        lanes.append(options[choice[0]])
+        lanes += ways[choice[0]]
         state = choice[1]
+    behind = [lane for lane in town.successors(lanes[-1]) if town.lane_manoeuvre[lane] == SubTask.LANEFOLLOW]
+    if not behind:
+        raise UnrealisableError(f"{command.name!r} from lane {approach} of {town.name!r} ends between two junctions")
+    return Route(town, (*lanes, behind[0]), 0.0, float(town.lane_length[behind[0]]))
+
+
+def _ways_on(town: Town, lane: int) -> dict[SubTask, tuple[int, ...]]:
+    """The lanes after ``lane`` up to and through the next junction, by what is done there; the first way of each."""
+    ways: dict[SubTask, tuple[int, ...]] = {}
+    paths: list[tuple[int, ...]] = [()]
+    seen = {lane}
+    for path in paths:  # grows on the way: where lanes part before the junction, all of them are looked at
+        for following in town.successors(path[-1] if path else lane):
+            manoeuvre = SubTask(int(town.lane_manoeuvre[following]))
+            if manoeuvre != SubTask.LANEFOLLOW:
+                ways.setdefault(manoeuvre, (*path, following))
+            elif following not in seen:
+                seen.add(following)
+                paths.append((*path, following))
+    return ways
 
 
 def plan_routes(town: Town, command: Command) -> list[Route]:

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from ldrl.towns.ground import SIDEWALK, TEXELS, Ground, stations
+from ldrl.towns.ground import SIDEWALK, Ground, stations
 from ldrl.towns.noise import hash_uniform
 from ldrl.towns.surface import CELL, LANE_SPACING, rasterise, sample
 
@@ -70,12 +70,11 @@ class Scenery(nn.Module):
         surface = rasterise(town.points.cpu(), town.headings.cpu(), town.half_width.cpu(), LANE_SPACING, REACH)
         beyond = surface.road_distance[0, 0]
         lots = _Lots(town, self.seed, surface.origin, surface.nearest_point, beyond)
-        inside = nn.functional.interpolate(lots.walls[:, :1], scale_factor=TEXELS, mode="bilinear")[0, 0]
         ground = Ground(town, self.seed, surface.origin, surface.nearest_point, beyond)
         props = _props(town, self.seed, surface.origin, beyond)
         extent = (torch.tensor(beyond.shape) * CELL / PROP_CELL).ceil().long().tolist()
         self._buffer("corner", surface.origin - CELL / 2)
-        self._buffer("ground", ground.materials(lots.green, inside))
+        self._buffer("ground", ground.materials(lots.green, lots.walls[0, 0]))
         self._buffer("walls", lots.walls)
         self._buffer("facade", lots.facade)
         self._buffer("props", props)

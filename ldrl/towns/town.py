@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
+from highway_env.road.lane import AbstractLane
 from highway_env.road.road import RoadNetwork
 from torch import Tensor, nn
 
 from ldrl.subtasks import SubTask
-from ldrl.towns import surface
-from ldrl.towns.layout import load_layout
+from ldrl.towns import opendrive, surface
+from ldrl.towns.layout import LAYOUTS, load_layout
 from ldrl.towns.scenery import Scenery
 from ldrl.towns.surface import LANE_SPACING
 
@@ -34,7 +36,9 @@ class Town(nn.Module):
 
     Args:
         name: the name that episodes and reports use.
-        network: a highway-env network whose lanes carry a ``manoeuvre`` (:class:`~ldrl.subtasks.SubTask`).
+        network: a highway-env network whose lanes carry a ``manoeuvre`` (:class:`~ldrl.subtasks.SubTask`). Those of
+            junctions may carry ``options``, the manoeuvres that the road offers which they come from; without, these
+            are the ones that the lane before offers.
 
     Attributes:
         lane_length: ``[L]`` float32, m.
@@ -42,6 +46,7 @@ class Town(nn.Module):
         lane_successors: ``[L, S]`` int64, padded by repeating the first successor.
         lane_successor_count: ``[L]`` int64.
         lane_predecessor: ``[L]`` int64, one lane that leads into the lane.
+        lane_options: for each lane of a junction what its road of entry offers there; empty for other lanes.
         lane_to_junction: ``[L]`` float32, from the lane's end to the entry of the next junction, m.
         half_width: ``[P]`` float32, half the width of the lane and its shoulder at each point, m.
         road_distance: ``[1, 1, H, W]`` float32, see :class:`~ldrl.towns.surface.Surface`.
@@ -88,29 +93,34 @@ class Town(nn.Module):
         lanes = [network.get_lane(index) for index in self.lane_indices]
         self._register_lanes(lanes)
         self._register_links()
-        self._buffer(
-            "half_width", torch.full((len(self.points),), max(lane.width_at(0) for lane in lanes) / 2 + SHOULDER)
-        )
+        self.lane_options = [self._options(i, lane) for i, lane in enumerate(lanes)]
         self._register_surface()
 
     @classmethod
-    def load(cls, name: str) -> Town:
-        """A built-in town.
+    def load(cls, name: str | Path) -> Town:
+        """A built-in town, or the map in an OpenDRIVE file.
 
         Args:
-            name: ``"town1"`` or ``"town2"``.
+            name: ``"town1"``, ``"town2"`` or the path of a file that ends in ``.xodr``, see
+                :func:`~ldrl.towns.opendrive.load_network`. The town of a file is named like the file, without folder.
 
         Raises:
-            ValueError: no town has that name.
+            FileNotFoundError: there is no such file.
+            ValueError: no town has that name, or no town can be made of the file.
         """
+        name = str(name)
+        if name.endswith(".xodr"):
+            return cls(Path(name).name, opendrive.load_network(name))
+        if name not in LAYOUTS:
+            raise ValueError(f"unknown town {name!r}; use one of {', '.join(LAYOUTS)}, or the path of a .xodr file")
         return cls(name, load_layout(name).network())
 
     def _buffer(self, name: str, value: Tensor | np.ndarray | list) -> None:
         self.register_buffer(name, torch.as_tensor(value), persistent=False)
 
     def _register_lanes(self, lanes: list) -> None:
-        counts = [max(1, math.ceil(lane.length / LANE_SPACING)) for lane in lanes]
-        stations = [np.linspace(0, lane.length, n + 1) for lane, n in zip(lanes, counts, strict=True)]
+        stations = [_stations(lane) for lane in lanes]
+        counts = [len(along) - 1 for along in stations]
         points = [[lane.position(s, 0) for s in along] for lane, along in zip(lanes, stations, strict=True)]
         headings = [np.unwrap([lane.heading_at(s) for s in along]) for lane, along in zip(lanes, stations, strict=True)]
         self._buffer("points", np.concatenate(points).astype(np.float32))
@@ -118,6 +128,8 @@ class Town(nn.Module):
         self._buffer("lane_first", np.cumsum([0] + [n + 1 for n in counts[:-1]]))
         self._buffer("lane_length", np.array([lane.length for lane in lanes], np.float32))
         self._buffer("lane_spacing", self.lane_length / torch.tensor(counts))
+        widths = [lane.width_at(s) for lane, along in zip(lanes, stations, strict=True) for s in along]
+        self._buffer("half_width", np.array(widths, np.float32) / 2 + SHOULDER)
         self._buffer("lane_manoeuvre", [int(lane.manoeuvre) for lane in lanes])
 
     def _register_links(self) -> None:
@@ -138,6 +150,11 @@ class Town(nn.Module):
         self._buffer("lane_predecessor", predecessor)
         self._buffer("lane_to_junction", [self._distance_to_junction(i) for i in range(len(successors))])
 
+    def _options(self, i: int, lane: AbstractLane) -> frozenset[SubTask]:
+        """What can be done at the junction that a lane belongs to by cars that come the same way."""
+        beside = self.successors(int(self.lane_predecessor[i])) if lane.manoeuvre != SubTask.LANEFOLLOW else []
+        return getattr(lane, "options", frozenset(SubTask(int(self.lane_manoeuvre[k])) for k in beside))
+
     def _distance_to_junction(self, lane: int) -> float:
         """Arc length from the end of ``lane`` to the next junction; infinite on a loop without one."""
         distance = 0.0
@@ -149,7 +166,10 @@ class Town(nn.Module):
         return math.inf
 
     def _register_surface(self) -> None:
-        rasters = surface.rasterise(self.points, self.headings, self.half_width, LANE_SPACING)
+        try:
+            rasters = surface.rasterise(self.points, self.headings, self.half_width, LANE_SPACING)
+        except ValueError as error:
+            raise ValueError(f"town {self.name!r}: {error}") from None
         lane_of_point = torch.searchsorted(self.lane_first, torch.arange(len(self.points)), right=True) - 1
         on_street = self.lane_manoeuvre[lane_of_point[rasters.nearest_point]] == SubTask.LANEFOLLOW
         on_street &= rasters.road_distance[0, 0] < 0
@@ -241,3 +261,8 @@ class Town(nn.Module):
     def extra_repr(self) -> str:
         """Name and size."""
         return f"{self.name!r}, {len(self.lane_length)} lanes, {float(self.lane_length.sum()) / 1000:.1f} km"
+
+
+def _stations(lane: AbstractLane) -> np.ndarray:
+    """The arc lengths at which a lane is sampled, both ends included, m."""
+    return np.linspace(0, lane.length, max(1, math.ceil(lane.length / LANE_SPACING)) + 1)

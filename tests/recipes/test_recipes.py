@@ -13,11 +13,12 @@ import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
-from ldrl.envs import save_episodes
+from ldrl.envs import builtin_episodes, save_episodes
 from ldrl.language import KEYWORDS
 from ldrl.modules import AgentConfig, load_agent
 from ldrl.towns import Town
 
+MAP = Path(__file__).parents[1] / "towns" / "theta.xodr"
 RECIPES = Path(__file__).parents[2] / "recipes"
 TINY = ("model.conv_channels=[2,3,4]", "model.features=8", "model.low_level_hidden=6", "model.high_level_hidden=7")
 BRIEF = ("preset=smoke", "low_level_steps=2", "high_level_steps=2", "batch_slices=4", "batch_sequences=4")
@@ -158,6 +159,24 @@ def test_evaluate_prints_without_writing(trained, some, tmp_path, call):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.jsonl"]
 
 
+def test_evaluate_plans_episodes_on_a_map(trained, tmp_path, call, monkeypatch):
+    cwd, _ = trained
+    planned = iter(builtin_episodes(Town.load(MAP))[:3])
+    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town: list(planned))  # a few do
+    printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", f"episodes={MAP}", "out=m.json", cwd=tmp_path)
+    assert error in (None, 0)
+    assert "theta.xodr" in printed
+    records = json.loads((tmp_path / "m.json").read_text())["episodes"]
+    assert [record["id"] for record in records] == [f"theta.xodr-left-{k}" for k in range(3)]
+
+
+def test_evaluate_says_that_a_map_has_no_junction(trained, tmp_path, call, monkeypatch):
+    cwd, _ = trained
+    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town: [])
+    _, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", f"episodes={MAP}", cwd=tmp_path)
+    assert re.fullmatch(r"error: no keyword can be realised in .*theta\.xodr; give a map with junctions", error)
+
+
 def test_odd_instructions_are_no_errors(trained, some, tmp_path, call):
     cwd, _ = trained
     odd = ["word " * 5000, "zzyzzyx qwrtz", "🚗 ⬅️", "Links abbiegen!"]
@@ -208,6 +227,7 @@ def test_broken_episode_files(trained, some, tmp_path, call, line, message):
         (["checkpoint=foreign"], "agent.json is no agent config"),
         (["episodes=none.jsonl"], "there is no episode file 'none.jsonl'; give a JSON-lines file or 'builtin'"),
         (["episodes=7"], "there is no episode file '7'"),
+        (["episodes=none.xodr"], "there is no map 'none.xodr'; give an OpenDRIVE file"),
         (["out=no/such/folder.json"], "cannot write 'no/such/folder.json'"),
         (["out=cut"], "cannot write 'cut'"),
         (["num_cars=0"], "num_cars is 0; give at least 1"),
