@@ -1,5 +1,6 @@
 """Maps: street layouts, expanded into highway-env road networks, compiled into tensors; routes through them."""
 
+from ldrl.towns.generator import random_layout, random_town
 from ldrl.towns.layout import LAYOUTS, Layout, load_layout
 from ldrl.towns.matching import match_route
 from ldrl.towns.routes import Route, UnrealisableError, plan_route, plan_routes
@@ -16,4 +17,6 @@ __all__ = [
     "match_route",
     "plan_route",
     "plan_routes",
+    "random_layout",
+    "random_town",
 ]
