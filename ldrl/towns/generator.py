@@ -22,14 +22,14 @@ BLOCK_AREA = (7000.0, 18000.0)
 ASPECT = (0.6, 1.6)
 """Width by height of the rectangle."""
 SPACING = 40.0
-"""Least distance of two nodes; 49 in the built-in towns, m."""
-SNAP = 30.0
-"""A street that would end this close to another's end opposite is moved to meet it, in a four-way junction, m."""
+"""Least distance of two junctions, 49 in the built-in towns; streets that would end closer meet in one, m."""
+CROSSINGS = 0.4
+"""Share of streets that go for the nearest end of another opposite, however far, to make a four-way junction."""
 MISSING = 0.4
 """Streets taken away, at most, by blocks that stay."""
-LANE_WIDTH = (3.5, 4.5)
+LANE_WIDTH = (3.3, 4.5)
 """m."""
-JUNCTION_RADIUS = (6.0, 11.0)
+JUNCTION_RADIUS = (5.5, 12.0)
 """Of the turning centre lines; 5.8 to 10.8 in the built-in towns, m."""
 CORNER_RADIUS = (7.0, 20.0)
 """m."""
@@ -125,7 +125,8 @@ def _cut(low: Point, high: Point, rng: random.Random, streets: list[tuple[Point,
         sides = low[1 - axis], high[1 - axis]
         ends = [end[axis] for street in streets for end in street if end[1 - axis] in sides]  # the block's corners too
         nearest = min(ends, key=lambda end: abs(end - at))
-        at = nearest if abs(nearest - at) < SNAP else at
+        if abs(nearest - at) < SPACING or rng.random() < CROSSINGS:
+            at = nearest
         if low[axis] < at < high[axis] and all(end == at or abs(end - at) >= SPACING for end in ends):
             return ((at, low[1]), (at, high[1])) if axis == 0 else ((low[0], at), (high[0], at))
     return None
