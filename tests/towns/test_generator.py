@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections import Counter
+from random import Random
 
 import pytest
 
@@ -11,7 +12,7 @@ from ldrl.envs import builtin_episodes
 from ldrl.language import KEYWORDS, realised_by
 from ldrl.subtasks import SubTask
 from ldrl.towns import plan_routes, random_layout, random_town
-from ldrl.towns.generator import SPACING
+from ldrl.towns.generator import SPACING, _take_away_a_street
 
 
 def reached_from(lane, following):
@@ -93,6 +94,21 @@ def test_streets_keep_their_distance(layouts):
         for (start, _, _), lane in layout.network().lanes_dict().items():
             if start.endswith(":start"):
                 assert lane.length > 10  # behind a junction a built-in episode ends up to 10 m on
+            elif lane.manoeuvre == SubTask.LANEFOLLOW:
+                assert hasattr(lane, "radius")  # a street that goes straight on has no node
+
+
+def test_no_street_is_taken_that_holds_a_town_together():
+    """Two rings at the ends of a street: none of the three may go."""
+    west, east = (0.0, 0.0), (100.0, 0.0)
+    ring = {(-60.0, 0.0): [west, (-60.0, 60.0)], (-60.0, 60.0): [(-60.0, 0.0), (0.0, 60.0)],
+            (0.0, 60.0): [(-60.0, 60.0), west]}  # fmt: skip
+    other = {(100.0 - x, -y): [(100.0 - a, -b) for a, b in arms] for (x, y), arms in ring.items()}
+    graph = {west: [(-60.0, 0.0), (0.0, 60.0), east], east: [(160.0, 0.0), (100.0, -60.0), west], **ring, **other}
+    before = {node: list(arms) for node, arms in graph.items()}
+    for seed in range(5):
+        _take_away_a_street(Random(seed), graph)
+        assert graph == before
 
 
 @pytest.mark.parametrize("blocks", [1, 0, -3])
