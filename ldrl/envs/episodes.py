@@ -19,6 +19,8 @@ START_BEFORE_JUNCTION = 35.0
 """Starts lie up to this far before the first junction (paper's evaluation), m."""
 END_BEHIND_JUNCTION = (5.0, 10.0)
 """Paths end this far past the exit of the last manoeuvre, m."""
+MOST_ROUTES = 40
+"""Built-in episodes of one keyword in one town, at most: a large town has thousands of routes."""
 FIELDS = ("id", "town", "keyword", "instruction", "start", "path")
 
 
@@ -86,14 +88,15 @@ def _is_finite(value: object) -> bool:
 
 
 def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout", seed: int = 0) -> list[Episode]:
-    """The built-in episodes: every distinct route of every keyword that the town can realise.
+    """The built-in episodes: the distinct routes of every keyword that the town can realise.
 
-    Each starts up to 35 m before its first junction and ends 5 to 10 m past the exit of its last manoeuvre.
+    Of a keyword with more than 40 routes, 40 are drawn. Each starts up to 35 m before its first junction and ends 5 to
+    10 m past the exit of its last manoeuvre.
 
     Args:
         town: the town.
         split: which sentences the passengers say.
-        seed: of the starts, ends and sentences.
+        seed: of the starts, ends, sentences and the routes where they are drawn.
 
     Examples:
         >>> episodes = builtin_episodes(Town.load("town2"))
@@ -105,10 +108,12 @@ def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout",
     episodes = []
     for keyword in KEYWORDS.values():
         try:
-            routes = plan_routes(town, keyword)
+            routes = dict(enumerate(plan_routes(town, keyword)))
         except UnrealisableError:
             continue
-        for k, route in enumerate(routes):
+        if len(routes) > MOST_ROUTES:
+            routes = {k: routes[k] for k in sorted(rng.sample(sorted(routes), MOST_ROUTES))}
+        for k, route in routes.items():
             start = rng.uniform(0, min(START_BEFORE_JUNCTION, float(town.lane_length[route.lanes[0]])))
             end = min(rng.uniform(*END_BEHIND_JUNCTION), float(town.lane_length[route.lanes[-1]]))
             driven = Route(town, route.lanes, float(town.lane_length[route.lanes[0]]) - start, end)

@@ -10,6 +10,7 @@ import torch
 from highway_env.road.lane import AbstractLane
 from highway_env.road.road import RoadNetwork
 from torch import Tensor, nn
+from torch.nn.functional import embedding
 
 from ldrl.subtasks import SubTask
 from ldrl.towns import opendrive, surface
@@ -66,12 +67,14 @@ class Town(nn.Module):
     lane_spacing: Tensor
     lane_first: Tensor
     lane_manoeuvre: Tensor
+    lane_pieces: Tensor
     lane_successors: Tensor
     lane_successor_count: Tensor
     lane_predecessor: Tensor
     lane_to_junction: Tensor
     points: Tensor
     headings: Tensor
+    pieces: Tensor
     road_distance: Tensor
     lane_direction: Tensor
     raster_origin: Tensor
@@ -130,6 +133,10 @@ class Town(nn.Module):
         self._buffer("lane_spacing", self.lane_length / torch.tensor(counts))
         widths = [lane.width_at(s) for lane, along in zip(lanes, stations, strict=True) for s in along]
         self._buffer("half_width", np.array(widths, np.float32) / 2 + SHOULDER)
+        last = torch.tensor(counts) - 1
+        self._buffer("lane_pieces", torch.stack((self.lane_length, self.lane_spacing, last, self.lane_first), -1))
+        poses = torch.cat((self.points, self.headings.unsqueeze(-1)), -1)
+        self._buffer("pieces", torch.cat((poses, poses.diff(dim=0, append=poses[-1:])), -1))
         self._buffer("lane_manoeuvre", [int(lane.manoeuvre) for lane in lanes])
 
     def _register_links(self) -> None:
@@ -220,17 +227,12 @@ class Town(nn.Module):
             ``[*B, N, 2]`` float32, m, and ``[*B, N]`` float32, rad.
         """
         window, along = self.locate(route, position)
-        lane = route.long().gather(-1, window)
-        step = along.clamp(min=0).minimum(self.lane_length[lane]) / self.lane_spacing[lane]
-        last = torch.round(self.lane_length[lane] / self.lane_spacing[lane]) - 1
+        length, spacing, last, first = embedding(route.long().gather(-1, window), self.lane_pieces).unbind(-1)
+        step = along.clamp(min=0).minimum(length) / spacing
         whole = step.floor().minimum(last)
-        index = self.lane_first[lane] + whole.long()
-        point, heading = self.points[index], self.headings[index]
-        part = step - whole
-        return (
-            point + part.unsqueeze(-1) * (self.points[index + 1] - point),
-            heading + part * (self.headings[index + 1] - heading),
-        )
+        piece = embedding((first + whole).long(), self.pieces)
+        pose = piece[..., :3] + (step - whole).unsqueeze(-1) * piece[..., 3:]
+        return pose[..., :2], pose[..., 2]
 
     def project(self, route: Tensor, xy: Tensor, guess: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Project points onto routes.
@@ -247,11 +249,10 @@ class Town(nn.Module):
         steps = torch.arange(-PROJECTION_REACH, PROJECTION_REACH + LANE_SPACING, LANE_SPACING, device=xy.device)
         candidates = guess.unsqueeze(-1) + steps
         points, headings = self.sample(route, candidates)
-        offset = xy.unsqueeze(-2) - points
-        closest = offset.square().sum(-1).argmin(-1, keepdim=True)
+        x, y = (xy.unsqueeze(-2) - points).unbind(-1)
+        closest = (x.square() + y.square()).argmin(-1, keepdim=True)
         heading = headings.gather(-1, closest)
-        offset = offset.gather(-2, closest.unsqueeze(-1).expand(*closest.shape, 2)).squeeze(-2)
-        along = offset[..., :1] * heading.cos() + offset[..., 1:] * heading.sin()
+        along = x.gather(-1, closest) * heading.cos() + y.gather(-1, closest) * heading.sin()
         position = candidates.gather(-1, closest) + along.clamp(-LANE_SPACING, LANE_SPACING)
         point, heading = self.sample(route, position)
         offset, heading = xy - point.squeeze(-2), heading.squeeze(-1)

@@ -62,6 +62,16 @@ def test_builtin_episodes_are_seeded(town2, episodes):
     assert all(e.instruction in set(Sentences("train").all(e.keyword)) for e in trained[:20])
 
 
+def test_of_many_routes_some_are_drawn(town2, episodes, monkeypatch):
+    monkeypatch.setattr("ldrl.envs.episodes.MOST_ROUTES", 5)
+    drawn, other = builtin_episodes(town2), builtin_episodes(town2, seed=1)
+    routes = {episode.id: episode.route(town2).lanes for episode in episodes["town2"]}
+    assert set(Counter(episode.keyword for episode in drawn).values()) == {5}
+    assert all(episode.route(town2).lanes == routes[episode.id] for episode in drawn)
+    assert builtin_episodes(town2) == drawn
+    assert {episode.id for episode in other} != {episode.id for episode in drawn}
+
+
 def test_there_and_back(tmp_path, episodes):
     save_episodes(episodes["town2"], tmp_path / "episodes.jsonl")
     loaded = load_episodes(tmp_path / "episodes.jsonl")
