@@ -60,8 +60,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--towns", nargs="+", default=["town1", "town2"])
     args = parser.parse_args()
-    print("| town | cars | worlds | world-steps with a contact | mean km/h | longest stand, s | "
-          "m in the last minute, slowest world | slowest car | world-steps/s |")
+    print(
+        "| town | cars | worlds | world-steps with a contact | mean km/h | longest stand, s | "
+        "m in the last minute, slowest world | slowest car | world-steps/s |"
+    )
     print("| --- |" + " ---: |" * 8)
     with torch.no_grad():
         for name in args.towns:

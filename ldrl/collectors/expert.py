@@ -75,8 +75,8 @@ def _give_way(
     steps = torch.arange(0, SIGHT + PATH_SPACING, PATH_SPACING, device=pose.device)
     points, headings = town.sample(route, along.unsqueeze(-1) + steps)
     gap, leader = distance_on_path(torch.cat((points, headings.unsqueeze(-1)), -1), traffic[..., :3]).min(-1)
-    leader_heading, leader_speed = traffic[..., 2:].gather(-2, leader[..., None, None].expand(*leader.shape, 1, 2)).squeeze(-2).unbind(-1)
-    leader_speed = (leader_speed * (leader_heading - pose[..., 2]).cos()).masked_fill(gap.isinf(), 0)
+    _, _, heading, leader_speed = traffic.take_along_dim(leader[..., None, None], -2).squeeze(-2).unbind(-1)
+    leader_speed = (leader_speed * (heading - pose[..., 2]).cos()).masked_fill(gap.isinf(), 0)
     line = distance_to_stop_line(distance_to_entry(town, route, along), right_of_way)
     gaps, speeds = torch.stack((gap, line), -1), torch.stack((leader_speed, torch.zeros_like(line)), -1)
     return idm_acceleration(speed.unsqueeze(-1), vehicle.CRUISE_SPEED, gaps, speeds).amin(-1)
@@ -85,7 +85,8 @@ def _give_way(
 class Expert(TensorDictModuleBase):
     """The expert as a policy; reads ``("world", ...)``, which no trained policy may.
 
-    At the end of an episode's path it declares ``("agent", "finish")`` and rolls to a stop.
+    At the end of an episode's path it declares ``("agent", "finish")`` and rolls to a stop. Where there is traffic it
+    reads that and the right of way, too.
 
     Args:
         town: the town that the cars drive in.
@@ -109,16 +110,10 @@ class Expert(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         pose, speed, route, position, remaining = (tensordict[key] for key in self.in_keys)
-        traffic, right_of_way = tensordict.get(keys.TRAFFIC, None), tensordict.get(keys.RIGHT_OF_WAY, None)
-        action = expert_action(
-            self.town,
-            pose,
-            speed.squeeze(-1),
-            route,
-            position.squeeze(-1),
-            traffic,
-            None if right_of_way is None else right_of_way.squeeze(-1),
-        )
+        others: tuple[Tensor, ...] = ()
+        if keys.TRAFFIC in tensordict.keys(True):
+            others = tensordict[keys.TRAFFIC], tensordict[keys.RIGHT_OF_WAY].squeeze(-1)
+        action = expert_action(self.town, pose, speed.squeeze(-1), route, position.squeeze(-1), *others)
         throttle, steer = action.unbind(-1)
         finish = remaining.squeeze(-1) <= 0
         tensordict[keys.ACTION] = torch.stack((torch.where(finish, throttle.clamp(max=0), throttle), steer), -1)

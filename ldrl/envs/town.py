@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase
 
 from ldrl import keys
 from ldrl.envs import vehicle
-from ldrl.envs.junctions import distance_to_entry
 from ldrl.envs.traffic import Agent, Traffic, random_turn
 from ldrl.subtasks import SubTask
 from ldrl.towns import ROUTE_LANES, Town
@@ -35,7 +34,7 @@ STANDING_STEPS = 30
 """A car that stands this long has ended its drive."""
 PATIENCE = 15.0
 """Time beyond one and a half times what the path needs at cruise speed before an episode is cut off, s."""
-TRAFFIC_PATIENCE = 3.0
+TRAFFIC_PATIENCE = 2
 """With traffic an episode may take this many times as long."""
 WAITING_DISTANCE = 25.0
 """A car that stands may be waiting for another one that is ahead of it and this near, m."""
@@ -62,7 +61,7 @@ class TownEnv(EnvBase):
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: start and path of each car, one per row, instead of roaming.
         max_steps: length of a roaming episode; episodes are given one and a half times the time that their path
-            takes at 20 km/h, and 15 s, and thrice that with traffic.
+            takes at 20 km/h, and 15 s; with traffic twice that.
         traffic: other cars in each world.
         device: where the tensors are.
         seed: of the env's own generator.
@@ -119,7 +118,7 @@ class TownEnv(EnvBase):
     def _make_traffic(self, cars: int) -> Traffic:
         starts = None if self.episodes is None else self._plan_pose[:, :2].float()
         if self.episodes is not None:
-            self._limit = (self._limit * TRAFFIC_PATIENCE).long()
+            self._limit = self._limit * TRAFFIC_PATIENCE
         return Traffic(self.town, self.numel(), cars, self._generator, starts)
 
     def _make_specs(self, traffic: int) -> None:
@@ -143,7 +142,9 @@ class TownEnv(EnvBase):
             self.observation_spec[keys.TRAFFIC] = real(traffic, 4)
             self.observation_spec[keys.RIGHT_OF_WAY] = flag()
         self.action_spec = Bounded(
-            torch.tensor([self._least_throttle, -1.0]).expand(*batch, 2), torch.tensor([1.0, 1.0]).expand(*batch, 2), device=device
+            torch.tensor([self._least_throttle, -1.0]).expand(*batch, 2),
+            torch.tensor([1.0, 1.0]).expand(*batch, 2),
+            device=device,
         )
         self.reward_spec = real(1)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=batch, device=device)
@@ -223,7 +224,11 @@ class TownEnv(EnvBase):
         self._steps += mask
         out = self._observe()
         stands = self._state[:, 3] < STANDING_SPEED
-        self._standing = torch.where(mask, (self._standing + ~self._may_wait()) * stands, self._standing)
+        standing = (self._standing + 1) * stands
+        if self._traffic is not None:
+            waits = self._traffic.any_ahead(out[keys.POSE], WAITING_DISTANCE)
+            standing = torch.where(waits, self._standing * stands, standing)
+        self._standing = torch.where(mask, standing, self._standing)
         out["reward"] = (self._progress - before).unsqueeze(-1)
         terminated = out[keys.COLLISION] | (self._standing >= STANDING_STEPS).unsqueeze(-1)
         truncated = (self._steps >= self._limit).unsqueeze(-1)
@@ -248,15 +253,6 @@ class TownEnv(EnvBase):
         state = self._state.float()
         return Agent(state[:, :3], state[:, 3], self._route, self._position)
 
-    def _may_wait(self) -> Tensor:
-        """Whether there is another car that a car may be waiting for, ``[B]`` bool."""
-        if self._traffic is None:
-            return torch.zeros_like(self._standing, dtype=torch.bool)
-        offset = self._traffic.state[..., :2] - self._state[:, None, :2].float()
-        heading = self._state[:, 2:3].float()
-        ahead = offset[..., 0] * heading.cos() + offset[..., 1] * heading.sin() > 0
-        return (ahead & (offset.norm(dim=-1) < WAITING_DISTANCE)).any(-1)
-
     def _observe(self) -> TensorDictBase:
         pose = self._state[:, :3].float()
         corners = vehicle.footprint(pose)
@@ -278,9 +274,7 @@ class TownEnv(EnvBase):
         out[keys.COLLISION] = (beyond_edge > SIDEWALK).any(-1, keepdim=True)
         if self._traffic is not None:
             traffic = self._traffic.state
-            touched = vehicle.overlap(pose.unsqueeze(1), traffic[..., :3]).any(-1, keepdim=True)
-            to_entry = distance_to_entry(self.town, self._route, self._position)
             out[keys.TRAFFIC] = traffic
-            out[keys.COLLISION] |= touched
-            out[keys.RIGHT_OF_WAY] = self._traffic.right_of_way(self._route, to_entry).unsqueeze(-1)
+            out[keys.RIGHT_OF_WAY] = self._traffic.right_of_way(self._route, self._position).unsqueeze(-1)
+            out[keys.COLLISION] |= vehicle.overlap(pose.unsqueeze(1), traffic[..., :3]).any(-1, keepdim=True)
         return out

@@ -86,7 +86,9 @@ class Traffic:
         self._places = self._find_places()
         capacity = self._capacity(town.points if agent_starts is None else agent_starts)
         if cars > capacity:
-            raise ValueError(f"traffic={cars}: the streets of {town.name!r} have room for {capacity} other cars; use fewer")
+            raise ValueError(
+                f"traffic={cars}: the streets of {town.name!r} have room for {capacity} other cars; use fewer"
+            )
         self._route = torch.zeros(worlds, cars, ROUTE_LANES, dtype=torch.long, device=town.points.device)
         self._position = torch.zeros(worlds, cars, device=town.points.device)
         self._speed = torch.zeros_like(self._position)
@@ -163,20 +165,35 @@ class Traffic:
         self._advance(position)
         self._path = self._look_ahead()
 
-    def right_of_way(self, route: Tensor, to_entry: Tensor) -> Tensor:
-        """Whether the lane that the agent's car takes next is free of cars that are in it or can no longer stop.
+    def right_of_way(self, route: Tensor, position: Tensor) -> Tensor:
+        """Whether no car is in the way of the agent's at the next junction: on an excluding lane, or unable to stop.
 
         Args:
-            route: ``[W, 6]`` int64, route window of the agent's car.
-            to_entry: ``[W]`` float32, how far it is from the junction, m.
+            route: ``[W, 6]`` int64, the agent's route window.
+            position: ``[W]`` float32, the agent's route position, m.
 
         Returns:
-            ``[W]`` bool, true where no junction is ahead.
+            ``[W]`` bool, true where the lane does not end at a junction.
         """
-        entry = distance_to_entry(self.town, self._route, self._position)
-        entering = self._may_enter & self._junctions.committed(entry, self._speed)
+        to_entry = distance_to_entry(self.town, self._route, self._position)
+        entering = self._may_enter & self._junctions.committed(to_entry, self._speed)
         closed = self._junctions.closed(self._junctions.exclude, self._route, self._position, entering)
-        return ~closed.gather(1, route[:, 2:3]).squeeze(-1) | to_entry.isinf()
+        free = ~closed.gather(1, route[:, 2:3]).squeeze(-1)
+        return free | distance_to_entry(self.town, route, position).isinf()
+
+    def any_ahead(self, pose: Tensor, distance: float) -> Tensor:
+        """Whether there is a car in front of the agent's, to whichever side.
+
+        Args:
+            pose: ``[W, 3]`` float32, the agent's: x, y (m) and heading (rad).
+            distance: how far to look, m.
+
+        Returns:
+            ``[W]`` bool.
+        """
+        offset = self._path[:, :, 0, :2] - pose[:, None, :2]
+        direction = torch.stack((pose[:, 2].cos(), pose[:, 2].sin()), -1).unsqueeze(1)
+        return (((offset * direction).sum(-1) > 0) & (offset.norm(dim=-1) < distance)).any(-1)
 
     def _uniform(self, shape: tuple[int, int]) -> Tensor:
         return torch.rand(shape, generator=self._generator, device=self.town.points.device)
@@ -185,8 +202,8 @@ class Traffic:
         """Who may enter, and how long they have waited."""
         junctions = self._junctions
         entry = distance_to_entry(self.town, agent.route, agent.position)
-        behind = (self._route[..., 1] == agent.route[:, 1:2]) & (self._position > agent.position.unsqueeze(-1))
-        drives = (agent.speed >= MOVING_SPEED) & (entry < CLAIM_DISTANCE) & ~behind.any(-1)
+        before = (self._route[..., 1] == agent.route[:, 1:2]) & (self._position > agent.position.unsqueeze(-1))
+        drives = (agent.speed >= MOVING_SPEED) & (entry < CLAIM_DISTANCE) & ~before.any(-1)
         entering = drives | (entry < vehicle.LENGTH / 2)
         by_agent = junctions.closed(
             junctions.exclude_any_turn, agent.route.unsqueeze(1), agent.position.unsqueeze(1), entering.unsqueeze(1)
