@@ -20,7 +20,7 @@ STUCK = 600
 
 def drive(town: Town, worlds: int, cars: int, steps: int) -> list[str]:
     """Move the cars of some worlds and look at every step."""
-    traffic = Traffic(town, worlds, cars, torch.Generator().manual_seed(0))
+    traffic = Traffic(town, worlds, cars, torch.Generator().manual_seed(0), town.points)
     nowhere = torch.full((worlds, 3), 1e6)
     agent = Agent(nowhere, torch.zeros(worlds), torch.zeros(worlds, 6, dtype=torch.long), torch.zeros(worlds))
     mask = torch.ones(worlds, dtype=torch.bool)

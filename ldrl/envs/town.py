@@ -67,8 +67,8 @@ class TownEnv(EnvBase):
         seed: of the env's own generator.
 
     Raises:
-        ValueError: no cars, an episode of another town, or one whose start or path is off the road, or
-            more traffic than the streets have room for.
+        ValueError: no cars, an episode of another town, one whose start or path is off the road, or more traffic than
+            the streets have room for.
 
     Examples:
         >>> env = TownEnv(Town.load("town1"), num_cars=3)
@@ -112,14 +112,11 @@ class TownEnv(EnvBase):
         self._planned = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         if episodes is not None:
             self._load(episodes)
-        self._traffic = self._make_traffic(traffic) if traffic else None
+        starts = self.town.points if episodes is None else self._plan_pose[:, :2].float()
+        self._traffic = Traffic(self.town, num_cars, traffic, self._generator, starts) if traffic else None
+        if episodes is not None and traffic:
+            self._limit *= TRAFFIC_PATIENCE
         self._make_specs(traffic)
-
-    def _make_traffic(self, cars: int) -> Traffic:
-        starts = None if self.episodes is None else self._plan_pose[:, :2].float()
-        if self.episodes is not None:
-            self._limit = self._limit * TRAFFIC_PATIENCE
-        return Traffic(self.town, self.numel(), cars, self._generator, starts)
 
     def _make_specs(self, traffic: int) -> None:
         batch, device = self.batch_size, self.device
@@ -210,7 +207,8 @@ class TownEnv(EnvBase):
         moving = tensordict.get("_step", None)
         mask = torch.ones_like(self._steps, dtype=torch.bool) if moving is None else moving.view(self.batch_size)
         if self._traffic is not None:
-            self._traffic.step(mask, self._agent())
+            here = self._state.float()
+            self._traffic.step(mask, Agent(here[:, :3], here[:, 3], self._route, self._position))
         throttle, steer = tensordict[keys.ACTION].double().unbind(-1)
         speed = self._state[:, 3]
         state = vehicle.bicycle_step(
@@ -249,10 +247,6 @@ class TownEnv(EnvBase):
         self._planned = self._planned + passed
         self._route = torch.where(passed.unsqueeze(-1), shifted, self._route)
 
-    def _agent(self) -> Agent:
-        state = self._state.float()
-        return Agent(state[:, :3], state[:, 3], self._route, self._position)
-
     def _observe(self) -> TensorDictBase:
         pose = self._state[:, :3].float()
         corners = vehicle.footprint(pose)
@@ -273,8 +267,8 @@ class TownEnv(EnvBase):
         out[keys.WRONG_LANE] = oncoming.sum(-1, keepdim=True) >= WRONG_LANE_CORNERS
         out[keys.COLLISION] = (beyond_edge > SIDEWALK).any(-1, keepdim=True)
         if self._traffic is not None:
-            traffic = self._traffic.state
-            out[keys.TRAFFIC] = traffic
+            out[keys.TRAFFIC] = self._traffic.state
             out[keys.RIGHT_OF_WAY] = self._traffic.right_of_way(self._route, self._position).unsqueeze(-1)
-            out[keys.COLLISION] |= vehicle.overlap(pose.unsqueeze(1), traffic[..., :3]).any(-1, keepdim=True)
+            touching = vehicle.overlap(pose.unsqueeze(1), self._traffic.state[..., :3])
+            out[keys.COLLISION] |= touching.any(-1, keepdim=True)
         return out

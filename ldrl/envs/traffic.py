@@ -76,15 +76,13 @@ class Traffic:
         ValueError: ``cars`` is no number of cars, or the town's streets have no room for as many.
     """
 
-    def __init__(
-        self, town: Town, worlds: int, cars: int, generator: torch.Generator, agent_starts: Tensor | None = None
-    ) -> None:
+    def __init__(self, town: Town, worlds: int, cars: int, generator: torch.Generator, agent_starts: Tensor) -> None:
         if isinstance(cars, bool) or not isinstance(cars, int) or cars < 0:
             raise ValueError(f"traffic={cars!r}: give the number of other cars, an int of 0 or more")
         self.town, self._generator, self._shape = town, generator, (worlds, cars)
         self._junctions = Junctions(town)
         self._places = self._find_places()
-        capacity = self._capacity(town.points if agent_starts is None else agent_starts)
+        capacity = self._capacity(agent_starts)
         if cars > capacity:
             raise ValueError(
                 f"traffic={cars}: the streets of {town.name!r} have room for {capacity} other cars; use fewer"
@@ -100,7 +98,7 @@ class Traffic:
     def _find_places(self) -> tuple[Tensor, Tensor, Tensor]:
         """Lane, route position and point of every place to start at."""
         street = self.town.lane_manoeuvre == SubTask.LANEFOLLOW
-        count = ((self.town.lane_length / SPAWN_SPACING).long() * street).clamp(min=0)
+        count = (self.town.lane_length / SPAWN_SPACING).long() * street
         lane = torch.repeat_interleave(count)
         k = torch.arange(len(lane), device=lane.device) - (count.cumsum(0) - count)[lane]
         position = (k + 0.5) * self.town.lane_length[lane] / count[lane]

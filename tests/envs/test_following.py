@@ -66,7 +66,7 @@ def test_a_platoon_moves_as_highway_envs(ring, nobody):
     speeds, targets = [5.0, 2.0, 5.5, 4.0, 3.0, 5.0], [5.5, 5.0, 5.5, 5.2, 3.0, 4.0]
     road = straight_road()
     cars = [idm_vehicle(road, *values) for values in zip(starts, speeds, targets, strict=True)]
-    traffic = Traffic(ring, 1, 6, torch.Generator())
+    traffic = Traffic(ring, 1, 6, torch.Generator(), ring.points)
     lane = ring.lane_indices.index(("a>b:start", "a>b:end", 0))
     traffic._route[:] = around(ring, lane)
     traffic._position[0], traffic._speed[0], traffic._desired[0] = map(torch.tensor, (starts, speeds, targets))
@@ -88,7 +88,7 @@ def test_a_platoon_moves_as_highway_envs(ring, nobody):
 
 
 def test_brakes_at_the_limit_and_never_reverses(ring, nobody):
-    traffic = Traffic(ring, 1, 2, torch.Generator())
+    traffic = Traffic(ring, 1, 2, torch.Generator(), ring.points)
     traffic._route[:] = around(ring, ring.lane_indices.index(("a>b:start", "a>b:end", 0)))
     traffic._position[0], traffic._speed[0], traffic._desired[0] = torch.tensor([[50.0, 58.0], [5.0, 0.0], [5.0, 1e-9]])
     traffic._path = traffic._look_ahead()
@@ -102,7 +102,7 @@ def test_brakes_at_the_limit_and_never_reverses(ring, nobody):
 
 
 def test_distance_on_route_equals_a_loop(town2):
-    traffic = Traffic(town2, 3, 60, torch.Generator().manual_seed(0))
+    traffic = Traffic(town2, 3, 60, torch.Generator().manual_seed(0), town2.points)
     traffic.reset(torch.ones(3, dtype=torch.bool), torch.full((3, 3), 1e6))
     route, position = traffic._route, traffic._position.clone()
     junctions = (town2.lane_manoeuvre != SubTask.LANEFOLLOW).nonzero().flatten().tolist()
@@ -127,7 +127,7 @@ def test_distance_on_route_equals_a_loop(town2):
 
 def test_distance_on_path_equals_a_driven_footprint(crossing):
     """A car is in the way at the first place of the path where a car there would touch it, half a length further on."""
-    traffic = Traffic(crossing, 1, 60, torch.Generator().manual_seed(0))
+    traffic = Traffic(crossing, 1, 60, torch.Generator().manual_seed(0), crossing.points)
     traffic.reset(torch.ones(1, dtype=torch.bool), torch.full((1, 3), 1e6))
     generator = torch.Generator().manual_seed(0)
     path = traffic._look_ahead()[0]

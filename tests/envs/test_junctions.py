@@ -32,7 +32,7 @@ def window(town, start, end):
 
 def place(town, cars):
     """A world with cars ``(start, end, metres before the entry, speed)`` around the four-way junction."""
-    traffic = Traffic(town, 1, len(cars), torch.Generator().manual_seed(0))
+    traffic = Traffic(town, 1, len(cars), torch.Generator().manual_seed(0), town.points)
     for k, (start, end, before, speed) in enumerate(cars):
         traffic._route[0, k] = torch.tensor(window(town, start, end))
         traffic._position[0, k] = town.lane_length[traffic._route[0, k, 1]] - before
@@ -138,6 +138,28 @@ def test_nobody_enters_without_room_behind(crossing, nobody):
         assert (int(traffic._route[0, 0, 1]) != approach) == enters
         tail = float(traffic._position[0, 0]) - 2.5
         assert tail > 0 if enters else -2 < float(crossing.lane_length[approach]) - tail - 6 < 0
+
+
+def test_room_is_kept_for_cars_that_are_still_in_the_junction(crossing, nobody):
+    """There is room for one car before the standing one, and car 1 is about to take it."""
+    approach, lane, exit_ = through(crossing, "north", "south")
+    traffic = place(
+        crossing, [("north", "south", 15.0, 5.0), ("north", "south", 0.0, 5.0), ("north", "south", 0.0, 0.0)]
+    )
+    traffic._route[0, 1] = torch.tensor([approach, lane, *[exit_] * 4])
+    traffic._route[0, 2] = torch.tensor([lane, *[exit_] * 5])
+    traffic._position[0, 1] = 3.0
+    for _ in range(200):
+        traffic._position[0, 2], traffic._speed[0, 2] = 18.0, 0.0
+        traffic.step(EVERY, nobody(1))
+    assert traffic._route[0, :, 1].tolist() == [approach, exit_, exit_]
+
+
+def test_an_agent_behind_another_car_claims_nothing(crossing):
+    traffic = place(crossing, [("south", "north", 3.5, 0.0)])
+    for _ in range(30):
+        traffic.step(EVERY, agent(crossing, "south", "north", 15.0, 5.0))
+    assert int(traffic._route[0, 0, 1]) == through(crossing, "south", "north")[1]
 
 
 def test_the_agent_goes_first_unless_it_stands(crossing):

@@ -32,7 +32,7 @@ def steer_clear(traffic, seconds, agent):
 @pytest.mark.parametrize("name", ["town1", "town2", "crossing"])
 def test_a_minute_of_traffic(request, name, nobody):
     town = request.getfixturevalue(name)
-    traffic = Traffic(town, 6, 20, torch.Generator().manual_seed(0))
+    traffic = Traffic(town, 6, 20, torch.Generator().manual_seed(0), town.points)
     traffic.reset(torch.ones(6, dtype=torch.bool), nobody(6).pose)
     driven = steer_clear(traffic, 60, nobody(6))
     assert driven.min() > 100
@@ -191,7 +191,7 @@ def test_bad_traffic_is_named(town2, episodes):
 
 def test_the_most_traffic_that_there_is_room_for(crossing, nobody):
     with pytest.raises(ValueError, match="room for") as error:
-        Traffic(crossing, 1, 10**6, torch.Generator())
+        Traffic(crossing, 1, 10**6, torch.Generator(), crossing.points)
     most = int(str(error.value).split("room for ")[1].split()[0])
     env = TownEnv(crossing, 16, traffic=most, seed=0)
     td = env.reset()
