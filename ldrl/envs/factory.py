@@ -26,6 +26,7 @@ def make_env(
     episodes: Sequence[Episode] | None = None,
     policy: TensorDictModuleBase | None = None,
     max_steps: int = 1000,
+    traffic: int = 0,
     device: torch.device | str = "cpu",
     seed: int = 0,
 ) -> TransformedEnv:
@@ -37,6 +38,7 @@ def make_env(
         episodes: one per row, with their instructions; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         max_steps: length of a roaming episode.
+        traffic: other cars in each world.
         device: where the tensors are.
         seed: of the env and of the instructions.
 
@@ -45,7 +47,7 @@ def make_env(
         ['done', 'end_of_subtask', 'instruction_tokens', 'observation', 'subtask', 'terminated', 'truncated', 'world']
     """
     town = Town.load(town) if isinstance(town, str) else town
-    env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, device=device, seed=seed)
+    env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, traffic=traffic, device=device, seed=seed)
     said = None if episodes is None else [episode.instruction for episode in episodes]
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
