@@ -39,6 +39,8 @@ FARTHEST = 120.0
 """Walls are seen up to here, m."""
 STEP = 0.08
 """Steps in which they are looked for, as a part of the depth."""
+COARSER = (14.0, 28.0)
+"""Beyond these depths the ground is seen in texels of 25 and of 50 cm, up to two pixels wide, m."""
 CAR_HEIGHT = 1.5
 """m; less than the camera's."""
 CARS_IN_SIGHT = 8
@@ -157,19 +159,22 @@ class Sight(nn.Module):
         slope = (torch.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
         down = (torch.arange(HORIZON) + 0.5) / FOCAL
         reach = ABOVE / down
-        between = [reach]
+        depths = []
         for near, far in pairwise(reach.flip(0).clamp(max=FARTHEST).tolist()):
             count = math.ceil((far / near - 1) / STEP)
-            between.append(torch.linspace(near, far, count + 1)[1:-1])
-        depths, order = torch.cat(between).sort()
+            depths.append(torch.linspace(near, far, count + 1)[1:-1])
+        between = torch.cat(depths)
+        ascending, order = torch.cat((between, reach)).sort()
+        # From coarse to fine; what lies between rows is looked at coarsely.
+        self.levels = [len(between) + int((reach > depth).sum()) for depth in (*COARSER[::-1], 0.0)]
         self._buffer("slope", slope)
         self._buffer("reach", reach)
-        self._buffer("depths", nn.functional.pad(depths, (0, 1), value=math.inf))
+        self._buffer("depths", nn.functional.pad(ascending, (0, 1), value=math.inf))
         self._buffer("row", torch.arange(HORIZON, dtype=torch.int16).unsqueeze(-1))
         self._buffer("rows_beyond", (reach >= self.depths.unsqueeze(-1)).sum(-1).to(torch.int16))
         self._buffer("far_depths", 10 * (FARTHEST / 10) ** torch.linspace(0, 1, 20))
-        self._buffer("rank", (len(depths) - order.argsort()).to(torch.uint8).unsqueeze(-1))
-        self._buffer("rays", _fan(torch.cat(between), slope))
+        self._buffer("rank", (len(order) - order.argsort()).to(torch.uint8).unsqueeze(-1))
+        self._buffer("rays", _fan(torch.cat((between, reach)), slope))
         self._buffer("far_rays", _fan(self.far_depths, slope))
 
     def _buffer(self, name: str, value: Tensor) -> None:
@@ -182,12 +187,18 @@ class Sight(nn.Module):
             ``[N, 44, 200]`` uint8 :class:`~ldrl.towns.ground.Material` below the horizon, from the horizon down, and
             ``[N, 200]`` int64, the first of ``depths`` inside a wall, the last of all where there is none.
         """
-        height, width = scenery.ground.shape
-        x, y = mount.map(self.rays, scenery.corner, TEXELS / CELL)
-        index = y.clamp_(0, height - 1).int().mul_(width).add_(x.clamp_(0, width - 1).int())
-        ground = scenery.ground.view(-1).index_select(0, index.view(-1)).view(-1, len(self.rank), WIDTH)
+        pieces, start = [], 0
+        for level, end in zip((2, 1, 0), self.levels, strict=True):
+            texels = scenery.ground(level)
+            height, width = texels.shape
+            rays = self.rays[:, start * WIDTH : end * WIDTH]
+            x, y = mount.map(rays, scenery.corner, TEXELS / CELL / 2**level)
+            index = y.clamp_(0, height - 1).int().mul_(width).add_(x.clamp_(0, width - 1).int())
+            pieces.append(texels.view(-1).index_select(0, index.view(-1)).view(-1, end - start, WIDTH))
+            start = end
+        ground = torch.cat(pieces, 1)
         first = len(self.rank) - ((ground >> 7) * self.rank).amax(1).long()  # the highest bit says wall
-        return ground[:, :HORIZON], first
+        return ground[:, -HORIZON:], first
 
     def props(self, scenery: Scenery, mount: Mount, count: int) -> Props:
         """The nearest ``count`` trees and posts ahead."""

@@ -47,8 +47,8 @@ class Scenery(nn.Module):
         seed: of all that is drawn; None takes it from the town's name.
 
     Attributes:
-        ground: ``[4H, 4W]`` uint8, :class:`~ldrl.towns.ground.Material` plus shade of texels of 12.5 cm; texel (0, 0)
-            has its corner at ``corner``.
+        pyramid: ``[T]`` uint8, :class:`~ldrl.towns.ground.Material` plus shade of the ground's texels: of those of
+            12.5 cm, of every second, and of every fourth, which are all that distant pixels can tell apart.
         corner: ``[2]`` float32, x and y, m.
         walls: ``[1, 2, H, W]`` float32: depth inside buildings and hedges (m, negative outside), and their height
             (m).
@@ -57,7 +57,7 @@ class Scenery(nn.Module):
         nearby: ``[h, w, 24]`` int64, the props nearest to the cells of 8 m, by distance.
     """
 
-    ground: Tensor
+    pyramid: Tensor
     corner: Tensor
     walls: Tensor
     facade: Tensor
@@ -74,7 +74,10 @@ class Scenery(nn.Module):
         props = _props(town, self.seed, surface.origin, beyond)
         extent = (torch.tensor(beyond.shape) * CELL / PROP_CELL).ceil().long().tolist()
         self._buffer("corner", surface.origin - CELL / 2)
-        self._buffer("ground", ground.materials(lots.green, lots.walls[0, 0]))
+        levels = [ground.materials(lots.green, lots.walls[0, 0])]
+        levels += [levels[0][step // 2 :: step, step // 2 :: step] for step in (2, 4)]
+        self.sizes = [level.shape for level in levels]
+        self._buffer("pyramid", torch.cat([level.flatten() for level in levels]))
         self._buffer("walls", lots.walls)
         self._buffer("facade", lots.facade)
         self._buffer("props", props)
@@ -83,6 +86,15 @@ class Scenery(nn.Module):
 
     def _buffer(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
+
+    def ground(self, level: int = 0) -> Tensor:
+        """Materials of texels of 12.5 cm, twice or four times as much (level 0, 1, 2), ``[4H, 4W] / 2**level`` uint8.
+
+        Texel (0, 0) has its corner at ``corner``.
+        """
+        start = sum(height * width for height, width in self.sizes[:level])
+        height, width = self.sizes[level]
+        return self.pyramid[start : start + height * width].view(height, width)
 
 
 class _Lots:

@@ -22,7 +22,7 @@ def square():
 
 def ground_at(scenery, x, y):
     column, row = ((torch.stack((x, y)) - scenery.corner.unsqueeze(-1)) / TEXEL).long()
-    return scenery.ground[row, column]
+    return scenery.ground()[row, column]
 
 
 def test_hash_uniform():
@@ -79,7 +79,7 @@ def test_stop_lines_and_no_lines_in_junctions(town2):
 
 def test_buildings_stand_behind_the_sidewalk(town):
     scenery = town.scenery
-    rows, columns = (scenery.ground == Material.WALL).nonzero()[::97].unbind(-1)
+    rows, columns = (scenery.ground() == Material.WALL).nonzero()[::97].unbind(-1)
     spots = torch.stack((columns, rows), -1) * TEXEL + TEXEL / 2 + scenery.corner
     beyond = sample(town.road_distance, town.raster_origin, spots).squeeze(-1)
     assert beyond.min() > SIDEWALK
@@ -116,7 +116,7 @@ def test_depends_on_town_and_seed_only(square):
 
     again, other = Scenery(square), Scenery(square, seed=1)
     assert all(torch.equal(value, tensors(again)[name]) for name, value in tensors(square.scenery).items())
-    assert not torch.equal(other.ground, again.ground)
-    road = again.ground <= Material.STOP_LINE
-    assert torch.equal(other.ground <= Material.STOP_LINE, road)
+    assert not torch.equal(other.ground(), again.ground())
+    road = again.ground() <= Material.STOP_LINE
+    assert torch.equal(other.ground() <= Material.STOP_LINE, road)
     assert square.scenery is square.scenery
