@@ -53,7 +53,13 @@ def expert_action(
 
     Returns:
         ``[*B, 2]`` float32: throttle in [0, 1], with traffic in [-1, 1], and steer in [-1, 1].
+
+    Raises:
+        ValueError: only one of ``traffic`` and ``right_of_way`` is given.
     """
+    if (traffic is None) != (right_of_way is None):
+        missing = "traffic" if traffic is None else "right_of_way"
+        raise ValueError(f"expert_action without {missing}: give traffic and right_of_way together, or neither")
     along, _, _ = town.project(route, pose[..., :2], position)
     target, _ = town.sample(route, (along + LOOK_AHEAD).unsqueeze(-1))
     offset = target.squeeze(-2) - pose[..., :2]

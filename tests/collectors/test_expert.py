@@ -140,6 +140,11 @@ def test_stops_before_a_junction_that_others_have(town2, before, right_of_way, b
     assert (vehicle.acceleration(action[0, 0], torch.tensor(5.0)) < 0) == brakes
 
 
+def test_traffic_and_right_of_way_go_together(town2):
+    with pytest.raises(ValueError, match="without right_of_way: give traffic and right_of_way together"):
+        expert_action(*on_a_street(town2, 5.0, 60.0), torch.zeros(1, 1, 4))
+
+
 def test_waits_at_the_stop_line(town2):
     env, expert = TownEnv(town2, 1, traffic=1, seed=0), Expert(town2)
     td = env.reset()
