@@ -17,10 +17,10 @@ class PolylineLane(AbstractLane):
     """A lane whose centre line, heading and width are interpolated between samples; it runs on straight beyond them.
 
     highway-env's ``PolyLane`` searches its curve in Python loops, and takes headings from the points alone. Here a
-    look-up is a few numpy calls, and headings are given, so that points may lie close together or a little off.
+    look-up is a few numpy calls, and headings are given, so that points may lie on each other or a little off.
 
     Args:
-        points: ``[N, 2]``, at least two and no two equal ones in sequence, m.
+        points: ``[N, 2]``, m.
         headings: ``[N]``, directions of the centre line, rad.
         widths: ``[N]``, m.
         line_types: of the left and of the right side.

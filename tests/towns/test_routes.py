@@ -115,6 +115,18 @@ def test_planned_from_one_approach_only(town1):
         plan_route(town1, KEYWORDS["left"], approach)
 
 
+def test_a_street_that_the_lane_does_not_lead_into_counts(town1, monkeypatch):
+    """The passenger sees it, so "first right" does not mean the right turn at the junction after it."""
+    routes = [route for route in plan_routes(town1, KEYWORDS["first right"]) if route.manoeuvres == (S, R)]
+    approach, junction = routes[0].lanes[:2]
+    # as if there was another lane beside the approach, which turns right where this one does not
+    options = [frozenset((L, R, S)) if i == junction else offered for i, offered in enumerate(town1.lane_options)]
+    monkeypatch.setattr(town1, "lane_options", options)
+    with pytest.raises(UnrealisableError, match=r"'first right' meets a junction .* that offers only"):
+        plan_route(town1, KEYWORDS["first right"], approach)
+    assert plan_route(town1, KEYWORDS["second right"], approach).lanes == routes[0].lanes
+
+
 def test_a_keyword_that_a_town_cannot_realise(ring, no_left):
     with pytest.raises(
         UnrealisableError, match=r"'ring' cannot realise 'left' from any of its 0 approaches.*no junction"

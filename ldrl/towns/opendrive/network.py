@@ -24,8 +24,6 @@ MAX_TOTAL = 1_000_000.0
 """Length of all lanes of whatever type, m."""
 MAX_LANES = 32_767
 """What a route window of 16-bit integers can name."""
-NEAR = 0.1
-"""Where samples of two lanes that become one are closer, one of them is dropped, m."""
 MOST_NAMED = 20
 """Problems that a message names."""
 
@@ -128,13 +126,10 @@ def _network(graph: Graph[Chain], pieces: dict[LaneKey, LanePiece], tasks: dict[
 
 def _lane(pieces: list[LanePiece], task: Task) -> PolylineLane:
     """One lane of pieces that follow each other."""
-    samples = np.concatenate([np.column_stack((piece.points, piece.headings, piece.widths)) for piece in pieces])
-    # A step between two pieces that is too short to have a direction; the lane's two ends stay.
-    steps = np.hypot(*np.diff(samples[:, :2], axis=0).T)
-    joints = np.cumsum([len(piece.points) for piece in pieces[:-1]], dtype=int) - 1
-    samples = np.delete(samples, joints[steps[joints] < NEAR], axis=0)
-    on_street = task is FOLLOW
-    lines = (LineType.STRIPED, LineType.CONTINUOUS) if on_street else (LineType.NONE, LineType.NONE)
-    lane = PolylineLane(samples[:, :2], samples[:, 2], samples[:, 3], line_types=lines)
+    points, headings, widths = (
+        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("points", "headings", "widths")
+    )
+    lines = (LineType.STRIPED, LineType.CONTINUOUS) if task is FOLLOW else (LineType.NONE, LineType.NONE)
+    lane = PolylineLane(points, headings, widths, lines)
     lane.manoeuvre, lane.options = task
     return lane
