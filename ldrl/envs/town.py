@@ -190,8 +190,22 @@ class TownEnv(EnvBase):
             steer.clamp(-1, 1) * vehicle.MAX_STEERING_ANGLE,
             vehicle.acceleration(throttle.clamp(0, 1), speed),
         )
-        self._state = torch.where(mask.unsqueeze(-1), state, self._state)
-        before = self._progress
+        return self.follow(torch.where(mask.unsqueeze(-1), state, self._state), mask)
+
+    @property
+    def state(self) -> Tensor:
+        """``[B, 4]`` float64: x, y (m), heading (rad), speed (m/s)."""
+        return self._state
+
+    def follow(self, state: Tensor, mask: Tensor | None = None) -> TensorDictBase:
+        """What a step gives out when the cars have come to a state, be it by another simulator's physics.
+
+        Args:
+            state: ``[B, 4]`` float64, 0.1 s after the last one: x, y (m), heading (rad), speed (m/s).
+            mask: ``[B]`` bool, the cars that were to move; None for all.
+        """
+        mask = torch.ones_like(self._steps, dtype=torch.bool) if mask is None else mask
+        self._state, before = state, self._progress
         self._advance(mask)
         self._steps += mask
         stands = self._state[:, 3] < STANDING_SPEED
