@@ -13,14 +13,14 @@ from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ActionType, action_factory
 from highway_env.envs.common.graphics import EnvViewer
 from highway_env.envs.common.observation import ObservationType, observation_factory
-from highway_env.road.regulation import RegulatedRoad
+from highway_env.road.road import Road
 from highway_env.vehicle.kinematics import Vehicle
 from torchrl.data import TensorSpec
 
 from ldrl import keys
 from ldrl.envs import vehicle as car
 from ldrl.envs.episodes import Episode
-from ldrl.envs.highway_road import TownRoad, spawn
+from ldrl.envs.highway_road import IndexedRoad, mark_crossings, spawn
 from ldrl.envs.town import TownEnv
 from ldrl.towns import Town
 from ldrl.towns.network import IndexedNetwork
@@ -165,6 +165,8 @@ class HighwayTownEnv(AbstractEnv):
         wanted = self.config["town"]
         if self.town is None or wanted not in (self.town, self.town.name):
             self.town = Town.load(wanted) if isinstance(wanted, str) else wanted
+            self.network = IndexedNetwork(self.town.network.graph)
+            mark_crossings(self.network)
         episode = self.config["episode"]
         if isinstance(episode, Mapping):
             episode = Episode(**episode)
@@ -186,9 +188,9 @@ class HighwayTownEnv(AbstractEnv):
         self.seen = self.cars.reset()
         x, y, heading, speed = self.cars.state[0].tolist()
         if self.config["indexed"]:
-            self.road = TownRoad(IndexedNetwork(self.town.network.graph), np_random=self.np_random)
+            self.road = IndexedRoad(self.network, np_random=self.np_random)
         else:
-            self.road = RegulatedRoad(self.town.network, np_random=self.np_random)
+            self.road = Road(self.town.network, np_random=self.np_random)
         self.vehicle = self.action_type.vehicle_class(self.road, [x, y], heading, speed)
         self.road.vehicles.append(self.vehicle)
         spawn(self.road, self.config["vehicles_count"], utils.class_from_path(self.config["other_vehicles_type"]))

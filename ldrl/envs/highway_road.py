@@ -1,28 +1,36 @@
-"""highway-env's road with its traffic, made fast enough for towns."""
+"""highway-env's road and traffic for towns: fast, and with a right of way at junctions."""
 
 from __future__ import annotations
 
-import copy
 import math
+from itertools import combinations
 
 import numpy as np
 from highway_env.road.lane import AbstractLane
-from highway_env.road.regulation import RegulatedRoad
-from highway_env.road.road import LaneIndex, Road
+from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import RoadObject
 
 from ldrl.envs.vehicle import CRUISE_SPEED
 from ldrl.subtasks import SubTask
-from ldrl.towns.network import IndexedNetwork
+from ldrl.towns.network import IndexedNetwork, centre_line
 
-__all__ = ["IndexedRoad", "TownRoad", "TrafficVehicle", "spawn"]
+__all__ = ["IndexedRoad", "TrafficVehicle", "mark_crossings", "spawn"]
 
 GAP = 10.0
 """Smallest distance between the centres of two cars at the start, m."""
-PLAN_LANES = 4
-"""Lanes that a car's route goes on for; a prediction of 3 s looks at less."""
+PLAN_LANES = 3
+"""Lanes of a car's route at least, so that the next one is known also after it has left one."""
+CROSSING = 3.5
+"""Centre lines that come closer than this cross each other; oncoming lanes are 4 m apart, m."""
+STOP_BEFORE = 1.0
+"""A car that gives way stops this far before the junction, m."""
+ASK_BEFORE = 8.0
+"""This far before the stop a car asks for its way over a junction: the second in a queue is further away, m."""
+SLOW = 1.5
+"""Who drives slower may not clear the junction, m/s."""
 
 
 class IndexedRoad(Road):
@@ -66,70 +74,70 @@ class IndexedRoad(Road):
 
         vehicles, objects = [v for v in self.vehicles if is_near(v)], [o for o in self.objects if is_near(o)]
         connected = self.neighbour_vehicles_connected_lanes
-        return Road(self.network, vehicles, objects, self.np_random, False, connected).neighbour_vehicles(
-            vehicle, lane_index
-        )
-
-
-class TownRoad(RegulatedRoad, IndexedRoad):
-    """A :class:`~highway_env.road.regulation.RegulatedRoad` that predicts each car once, not once for each other."""
-
-    def enforce_road_rules(self) -> None:
-        """Stop the cars that have to yield and let go those that needn't any more."""
-        self._predicted: dict[int, tuple[float, float, float, float]] = {}
-        super().enforce_road_rules()
-
-    def is_conflict_possible(self, v1: Vehicle, v2: Vehicle) -> bool:  # type: ignore[override]
-        """Whether two cars come close within 3 s.
-
-        Args:
-            v1: a car.
-            v2: another.
-        """
-        left1, right1, top1, bottom1 = self._predict(v1)
-        left2, right2, top2, bottom2 = self._predict(v2)
-        apart = max(left1 - right2, left2 - right1, top1 - bottom2, top2 - bottom1)
-        return apart <= v1.LENGTH and bool(RegulatedRoad.is_conflict_possible(alone(v1), alone(v2)))
-
-    def _predict(self, vehicle: Vehicle) -> tuple[float, float, float, float]:
-        """A box that holds all positions that the conflict check looks at."""
-        if id(vehicle) not in self._predicted:
-            positions, _ = alone(vehicle).predict_trajectory_constant_speed(np.arange(0.25, 3, 0.25))
-            (left, top), (right, bottom) = np.min(positions, 0), np.max(positions, 0)
-            self._predicted[id(vehicle)] = float(left), float(right), float(top), float(bottom)
-        return self._predicted[id(vehicle)]
-
-
-def alone(vehicle: Vehicle) -> Vehicle:
-    """The car without its road where its predictions don't need one: highway-env deep-copies what they run on."""
-    if isinstance(vehicle, ControlledVehicle):
-        return vehicle
-    vehicle = copy.copy(vehicle)
-    vehicle.road = vehicle.lane = None
-    vehicle.history = type(vehicle.history)()
-    vehicle.position = vehicle.position.copy()
-    return vehicle
+        nearby = Road(self.network, vehicles, objects, self.np_random, False, connected)
+        return nearby.neighbour_vehicles(vehicle, lane_index)
 
 
 class TrafficVehicle(IDMVehicle):
-    """highway-env's IDM car on an endless route: random at every junction, at most 20 km/h, never backwards."""
+    """highway-env's IDM car on an endless route: random at every junction, at most 20 km/h, never backwards.
+
+    It crosses a junction only when nobody is on a lane that crosses its own, or has asked for one before, and when
+    there is room behind the junction. The lanes are marked by :func:`mark_crossings`.
+    """
+
+    claim: LaneIndex | None = None
+    """The junction's lane that others keep clear of."""
 
     def follow_road(self) -> None:
-        """Go on to the next lane of the route near the end of one; draw the lanes behind the route's end."""
+        """Go on to the next lane of the route near the end of one; the route never ends."""
         self.route = self.route or [self.target_lane_index]
         while len(self.route) < PLAN_LANES:
-            self.route.append(self._random_successor(self.route[-1]))
+            node, ends = self.route[-1][1], self.road.network.graph[self.route[-1][1]]
+            following = [(node, end, k) for end, lanes in ends.items() for k in range(len(lanes))]
+            self.route.append(following[int(self.road.np_random.integers(len(following)))])
         super().follow_road()
 
-    def _random_successor(self, index: LaneIndex) -> LaneIndex:
-        network = self.road.network
-        following = [(index[1], end, k) for end, lanes in network.graph[index[1]].items() for k in range(len(lanes))]
-        return following[int(self.road.np_random.integers(len(following)))]
-
     def act(self, action: dict | str | None = None) -> None:
-        """Decide; where the road's rules have reset the speed to aim for, it is capped again."""
-        self.target_speed = min(self.target_speed, CRUISE_SPEED)
+        """Steer and accelerate; brake before a junction that is not clear."""
         super().act(action)
+        if self.claim is not None:
+            along, _ = self.road.network.get_lane(self.claim).local_coordinates(self.position)
+            if along > self.road.network.get_lane(self.claim).length + self.LENGTH / 2:
+                self.claim = None
+        elif not self.crashed and self.road.network.get_lane(self.route[1]).manoeuvre != SubTask.LANEFOLLOW:
+            lane = self.road.network.get_lane(self.route[0])
+            to_stop = lane.length - lane.local_coordinates(self.position)[0] - self.LENGTH / 2 - STOP_BEFORE
+            if to_stop > ASK_BEFORE:
+                return
+            if self._may_cross(self.route[1]):
+                self.claim = self.route[1]
+            else:
+                braking = -self.speed**2 / (2 * max(to_stop, 0.1))
+                self.action["acceleration"] = max(min(self.action["acceleration"], braking), -self.ACC_MAX)
+
+    def _may_cross(self, index: LaneIndex) -> bool:
+        lane = self.road.network.get_lane(index)
+        for other in self.road.vehicles:
+            if other is self:
+                continue
+            if not lane.crossing.isdisjoint(claimed(other)):
+                return False
+            along, lateral = lane.local_coordinates(other.position)
+            if other.speed < SLOW and 0 < along < lane.length + 2.5 * self.LENGTH and abs(lateral) < CROSSING / 2:
+                return False
+        return True
+
+    def lane_distance_to(self, other: RoadObject, lane: AbstractLane | None = None) -> float:
+        """How far another car is ahead, m: along the lane, but not less than the straight line.
+
+        highway-env's projection onto the lane takes a car far down a side street for one right ahead.
+
+        Args:
+            other: the other car.
+            lane: to measure along; None for the car's.
+        """
+        along = super().lane_distance_to(other, lane)
+        return math.copysign(max(abs(along), np.hypot(*(other.position - self.position))), along)
 
     def step(self, dt: float) -> None:
         """Move; IDM alone would back off from a car that stands too close ahead.
@@ -140,20 +148,35 @@ class TrafficVehicle(IDMVehicle):
         self.action["acceleration"] = max(self.action["acceleration"], -self.speed / dt)
         super().step(dt)
 
-    def predict_trajectory_constant_speed(self, times: np.ndarray) -> tuple:
-        """Where it will be along its route; highway-env's own guess is a lane off just before a lane's end.
 
-        Args:
-            times: s.
+def claimed(vehicle: Vehicle) -> set[LaneIndex]:
+    """The lanes over a junction that a car needs; any that it can take, if it doesn't tell."""
+    if isinstance(vehicle, TrafficVehicle):
+        return {vehicle.claim} if vehicle.claim else set()
+    start, end, _ = vehicle.lane_index
+    network = vehicle.road.network
+    if vehicle.lane.manoeuvre == SubTask.LANEFOLLOW:
+        to_junction = vehicle.lane.length - vehicle.lane.local_coordinates(vehicle.position)[0]
+        if to_junction > ASK_BEFORE + vehicle.LENGTH or vehicle.speed < SLOW:
+            return set()
+        start = end
+    return {(start, to, k) for to, lanes in network.graph[start].items() for k in range(len(lanes))}
 
-        Returns:
-            Positions (m) and headings (rad).
-        """
-        network, target = self.road.network, self.target_lane_index
-        along, _ = network.get_lane(target).local_coordinates(self.position)
-        route = self.route or [target]
-        ahead = [network.position_heading_along_route(route, along + self.speed * t, 0, target) for t in times]
-        return tuple(zip(*ahead, strict=True))
+
+def mark_crossings(network: RoadNetwork) -> None:
+    """Give each lane over a junction its ``crossing``: indices of the lanes from elsewhere that cross or meet it.
+
+    Args:
+        network: its lanes carry a ``manoeuvre``.
+    """
+    lanes = {index: lane for index, lane in network.lanes_dict().items() if lane.manoeuvre != SubTask.LANEFOLLOW}
+    points = {index: centre_line(lane) for index, lane in lanes.items()}
+    for lane in lanes.values():
+        lane.crossing = set()
+    for (a, of_a), (b, of_b) in combinations(points.items(), 2):
+        if a[0] != b[0] and np.hypot(*(of_a[:, None] - of_b).transpose(2, 0, 1)).min() < CROSSING:
+            lanes[a].crossing.add(b)
+            lanes[b].crossing.add(a)
 
 
 def spawn(road: Road, count: int, vehicle_class: type[ControlledVehicle]) -> None:
