@@ -19,7 +19,7 @@ from torchrl.data import TensorSpec
 
 from ldrl import keys
 from ldrl.envs import vehicle as car
-from ldrl.envs.episodes import Episode
+from ldrl.envs.episodes import FIELDS, Episode
 from ldrl.envs.highway_road import IndexedRoad, mark_crossings, spawn
 from ldrl.envs.town import TownEnv
 from ldrl.towns import Town
@@ -46,7 +46,7 @@ class ThrottleSteerAction(ActionType):
 
     def act(self, action: np.ndarray) -> None:
         """Set the wheel and the acceleration; values outside the space are clipped."""
-        space = self.space()
+        space = self.env.action_space
         throttle, steer = np.clip(np.asarray(action, np.float64), space.low, space.high)
         driven = self.controlled_vehicle
         acceleration = car.acceleration(torch.tensor(throttle), torch.tensor(driven.speed, dtype=torch.float64))
@@ -241,6 +241,8 @@ def check(config: Mapping[str, Any]) -> None:
         raise ValueError(f"town is {config['town']!r}; give a Town or the name of one")
     if not isinstance(config["episode"], Episode | Mapping | None):
         raise ValueError(f"episode is {config['episode']!r}; give an Episode, a dictionary of its fields, or None")
+    if isinstance(config["episode"], Mapping) and set(config["episode"]) != set(FIELDS):
+        raise ValueError(f"episode has {', '.join(map(str, config['episode']))}; an episode has {', '.join(FIELDS)}")
     for name, least in (("vehicles_count", 0), ("max_steps", 1)):
         if type(config[name]) is not int or config[name] < least:
             raise ValueError(f"{name}={config[name]!r}; give a whole number from {least}")

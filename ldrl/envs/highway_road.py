@@ -66,16 +66,15 @@ class IndexedRoad(Road):
             vehicle: the car.
             lane_index: of the lane to look at; None for the car's.
         """
-        left, right, top, bottom = self.network.surroundings(lane_index or vehicle.lane_index)
-
-        def is_near(other: Vehicle) -> bool:
-            x, y = other.position
-            return left <= x <= right and top <= y <= bottom
-
-        vehicles, objects = [v for v in self.vehicles if is_near(v)], [o for o in self.objects if is_near(o)]
-        connected = self.neighbour_vehicles_connected_lanes
-        nearby = Road(self.network, vehicles, objects, self.np_random, False, connected)
-        return nearby.neighbour_vehicles(vehicle, lane_index)
+        network, (left, right, top, bottom) = self.network.surroundings(lane_index or vehicle.lane_index)
+        others = [other for other in self.vehicles + self.objects if other is not vehicle]
+        x, y = np.array([other.position for other in others] or [[math.nan, math.nan]]).T
+        inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+        near = [others[k] for k in np.flatnonzero(inside.any(0)).tolist()]
+        if not near:
+            return None, None
+        around = Road(network, near, None, self.np_random, False, self.neighbour_vehicles_connected_lanes)
+        return around.neighbour_vehicles(vehicle, lane_index)
 
 
 class TrafficVehicle(IDMVehicle):
@@ -112,7 +111,7 @@ class TrafficVehicle(IDMVehicle):
             if self._may_cross(self.route[1]):
                 self.claim = self.route[1]
             else:
-                braking = -self.speed**2 / (2 * max(to_stop, 0.1))
+                braking = -(self.speed**2) / (2 * max(to_stop, 0.1))
                 self.action["acceleration"] = max(min(self.action["acceleration"], braking), -self.ACC_MAX)
 
     def _may_cross(self, index: LaneIndex) -> bool:

@@ -20,8 +20,8 @@ SURELY = 0.9
 beyond the ends of wavy ones."""
 REACH = 12.0
 """How much further than its nearest lane a cell lists lanes, m; a heading against the lane counts as 3.1 m."""
-ON_LANE = 7.0
-"""highway-env takes a car for being on a lane up to 5 m beyond the lane's ends and 1 m beside it, m."""
+BESIDE = 1.5
+"""highway-env takes a car for being on a lane up to 1 m beside it, and 5 m beyond its ends, m."""
 
 
 class _Candidate(NamedTuple):
@@ -31,6 +31,15 @@ class _Candidate(NamedTuple):
     """Place in the network, which decides between lanes that are equally close."""
     index: LaneIndex
     lane: AbstractLane
+
+
+class Surroundings(NamedTuple):
+    """What is near a road."""
+
+    network: RoadNetwork
+    """The road, those that lead into it and those that follow it, in the order of the whole network."""
+    boxes: np.ndarray
+    """``[4, N, 1]`` float64: smallest and largest x, smallest and largest y (m) of the cars on each of their lanes."""
 
 
 class IndexedNetwork(RoadNetwork):
@@ -58,7 +67,7 @@ class IndexedNetwork(RoadNetwork):
     def _forget(self) -> None:
         self._lanes: list[tuple[LaneIndex, AbstractLane]] = []
         self._cells: dict[tuple[int, int], list[_Candidate]] = {}
-        self._surroundings: dict[tuple[str, str], tuple[float, float, float, float]] = {}
+        self._surroundings: dict[tuple[str, str], Surroundings] = {}
 
     def add_lane(self, _from: str, _to: str, lane: AbstractLane) -> None:
         """Add a lane; the index is built anew."""
@@ -109,28 +118,33 @@ class IndexedNetwork(RoadNetwork):
         self._points = np.concatenate(samples)
         self._first = np.cumsum([0] + [len(points) for points in samples[:-1]])
 
-    def surroundings(self, index: LaneIndex) -> tuple[float, float, float, float]:
-        """A box that holds all cars on a road, on those that lead into it and on those that it leads to.
+    def surroundings(self, index: LaneIndex) -> Surroundings:
+        """A road with those that lead into it and those that follow it.
 
         Args:
             index: of a lane of the road.
-
-        Returns:
-            Smallest and largest x, smallest and largest y, m.
         """
         start, end, _ = index
         if (start, end) not in self._surroundings:
-            roads = [self.graph[start][end], *self.graph.get(end, {}).values()]
-            roads += [ends[start] for ends in self.graph.values() if start in ends]
-            lanes = [lane for road in roads for lane in road]
-            points = np.concatenate([centre_line(lane) for lane in lanes])
-            margin = max(lane.width_at(s) for lane in lanes for s in np.linspace(0, lane.length, 9)) / 2 + ON_LANE
-            (left, top), (right, bottom) = points.min(0) - margin, points.max(0) + margin
-            self._surroundings[start, end] = float(left), float(right), float(top), float(bottom)
+            network = RoadNetwork()
+            for node, ends in self.graph.items():
+                kept = {to: ends[to] for to in ends if node == end or to == start or (node, to) == (start, end)}
+                if kept:
+                    network.graph[node] = kept
+            boxes = np.array([box(lane) for lane in network.lanes_list()])
+            self._surroundings[start, end] = Surroundings(network, boxes.T[..., None])
         return self._surroundings[start, end]
 
 
-def centre_line(lane: AbstractLane) -> np.ndarray:
-    """Samples of a lane's centre line, both ends included: ``[N, 2]`` float64, m."""
-    pieces = max(1, math.ceil(lane.length / LANE_SPACING))
-    return np.array([lane.position(s, 0) for s in np.linspace(0, lane.length, pieces + 1)])
+def centre_line(lane: AbstractLane, beyond: float = 0.0) -> np.ndarray:
+    """Samples of a lane's centre line, both ends included and so far beyond them (m): ``[N, 2]`` float64, m."""
+    pieces = max(1, math.ceil((lane.length + 2 * beyond) / LANE_SPACING))
+    return np.array([lane.position(s, 0) for s in np.linspace(-beyond, lane.length + beyond, pieces + 1)])
+
+
+def box(lane: AbstractLane) -> tuple[float, float, float, float]:
+    """A box that holds all cars which highway-env takes for being on a lane."""
+    points = centre_line(lane, lane.VEHICLE_LENGTH)
+    margin = max(lane.width_at(s) for s in np.linspace(0, lane.length, 9)) / 2 + BESIDE
+    (left, top), (right, bottom) = points.min(0) - margin, points.max(0) + margin
+    return left, right, top, bottom
