@@ -15,6 +15,7 @@ from highway_env.envs.common.graphics import EnvViewer
 from highway_env.envs.common.observation import ObservationType, observation_factory
 from highway_env.road.road import Road
 from highway_env.vehicle.kinematics import Vehicle
+from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
 
 from ldrl import keys
@@ -61,7 +62,8 @@ class TownObservation(ObservationType):
 
     def space(self) -> Dict:
         """Arrays of the shapes and types of TownEnv's rows."""
-        world = {name: _box(spec) for name, spec in self.env.cars.observation_spec[keys.WORLD].items()}
+        specs = self.env.cars.observation_spec[keys.WORLD]
+        world: dict[str, Space] = {name: _box(spec) for name, spec in specs.items()}
         if self.env.config["vehicles_count"]:
             world[keys.TRAFFIC[-1]] = Box(-np.inf, np.inf, (self.env.config["vehicles_count"], 4), np.float32)
         return Dict({keys.WORLD: Dict(world)})
@@ -80,12 +82,13 @@ class TownObservation(ObservationType):
 
 def _box(spec: TensorSpec) -> Box:
     """The space of a row of a TownEnv's spec."""
-    example = spec.zero()[0].numpy()
+    example: Any = spec.zero()[0].numpy()
+    low, high = -np.inf, np.inf
     if spec.dtype == torch.bool:
-        return Box(0, 1, example.shape, np.bool_)
-    if spec.dtype.is_floating_point:
-        return Box(-np.inf, np.inf, example.shape, example.dtype.type)
-    return Box(spec.space.low[0].numpy(), spec.space.high[0].numpy(), dtype=example.dtype.type)
+        low, high = 0, 1
+    elif not spec.dtype.is_floating_point:
+        low, high = spec.space.low[0].numpy(), spec.space.high[0].numpy()
+    return Box(low, high, example.shape, dtype=example.dtype.type)
 
 
 class HighwayTownEnv(AbstractEnv):
@@ -117,8 +120,18 @@ class HighwayTownEnv(AbstractEnv):
         (5, 4)
     """
 
+    town: Town
+    network: IndexedNetwork
+    cars: TownEnv
+    """What is known of the car besides where highway-env says that it is."""
+    seen: TensorDictBase
+    """What ``cars`` gave out last."""
+    action_space: Space
+    observation_space: Space
+    viewer: EnvViewer | None
+
     def __init__(self, config: dict | None = None, render_mode: str | None = None, *, town: str | None = None) -> None:
-        self.town: Town | None = None
+        self._loaded: str | Town | None = None
         if town is not None:
             config = {"town": town} | (config or {})
         super().__init__(config, render_mode)
@@ -163,10 +176,11 @@ class HighwayTownEnv(AbstractEnv):
         super().configure(config)
         check(self.config)
         wanted = self.config["town"]
-        if self.town is None or wanted not in (self.town, self.town.name):
+        if wanted != self._loaded:
             self.town = Town.load(wanted) if isinstance(wanted, str) else wanted
             self.network = IndexedNetwork(self.town.network.graph)
             mark_crossings(self.network)
+            self._loaded = wanted
         episode = self.config["episode"]
         if isinstance(episode, Mapping):
             episode = Episode(**episode)

@@ -84,6 +84,7 @@ class TrafficVehicle(IDMVehicle):
     there is room behind the junction. The lanes are marked by :func:`mark_crossings`.
     """
 
+    route: list[LaneIndex]
     claim: LaneIndex | None = None
     """The junction's lane that others keep clear of."""
 

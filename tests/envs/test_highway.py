@@ -74,13 +74,10 @@ def test_same_seed_same_traffic_in_any_process_and_after_other_envs(env):
         "env = gymnasium.make('ldrl:ldrl/Town2-v0', config={'vehicles_count': 5}).unwrapped\n"
         "print(digest(env, 7))"
     )
-    path = os.pathsep.join(sys.path)
-    other = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}
-    )
-    assert other.returncode == 0, other.stderr
+    there = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    printed = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=there).stdout
     here = digest(env, 7)
-    assert here == other.stdout.strip()
+    assert here == printed.strip()
     busy = HighwayTownEnv({"town": env.town, "vehicles_count": 12, "observation": {"type": "Kinematics"}})
     busy.reset(seed=3)
     np.random.seed(1)

@@ -150,11 +150,11 @@ def test_crossings_of_a_t_junction(network):
         ways = junction(network, of)
         assert len(ways) == 2
         straight = lanes[ways[SubTask.STRAIGHT]]
+        end = straight.position(straight.length, 0)
         opposite = [
             index
             for index, lane in on_junctions.items()
-            if lane.manoeuvre == SubTask.STRAIGHT
-            and 3.9 < math.dist(lane.position(0, 0), straight.position(straight.length, 0)) < 4.1
+            if lane.manoeuvre == SubTask.STRAIGHT and 3.9 < math.dist(lane.position(0, 0), end) < 4.1
         ]
         assert len(opposite) == 1  # side by side, 4 m apart
         assert not lanes[opposite[0]].crossing & {ways[SubTask.STRAIGHT]}
@@ -169,9 +169,8 @@ def test_a_car_gives_way_to_one_that_crosses(town2):
     for blocked in (True, False):
         road = make_road(town2)
         lane, other = town2.get_lane(approach), town2.get_lane(crossing)
-        car = TrafficVehicle(
-            road, lane.position(lane.length - 15, 0), lane.heading_at(0), 5.0, approach, 5.5, [approach, way]
-        )
+        start = lane.position(lane.length - 15, 0), lane.heading_at(0)
+        car = TrafficVehicle(road, *start, 5.0, approach, 5.5, [approach, way])
         road.vehicles.append(car)
         if blocked:
             middle = other.length / 2
