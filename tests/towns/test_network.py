@@ -52,9 +52,10 @@ def test_same_lane_as_the_scan_for_every_type_of_lane(zoo):
 
 def test_the_first_of_equally_close_lanes_wins():
     index = IndexedNetwork()
-    for name in "qpr":
-        index.add_lane(name, name, StraightLane((0, 0), (50, 0)))
-    assert index.get_closest_lane_index(np.array([20.0, 1.0]), 0.3) == ("q", "q", 0)
+    for name, y in {"q": 1, "p": -3, "r": -3}.items():  # p and r are nearer to the middle of the cell
+        index.add_lane(name, name, StraightLane((0, y), (50, y)))
+    assert index.get_closest_lane_index(np.array([20.0, -1.0]), 0.3) == ("q", "q", 0)
+    assert index.get_closest_lane_index(np.array([20.0, -1.1]), 0.3) == ("p", "p", 0)
 
 
 def test_lanes_added_later_are_found(zoo):
