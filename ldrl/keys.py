@@ -29,6 +29,7 @@ __all__ = [
     "PREVIOUS_SUBTASK",
     "PROGRESS",
     "REMAINING",
+    "RIGHT_OF_WAY",
     "ROUTE",
     "ROUTE_POSITION",
     "SPEED",
@@ -42,7 +43,8 @@ __all__ = [
 ]
 
 ACTION = ACTION_KEY
-"""Throttle in [0, 1] and steer in [-1, 1] (positive turns right), ``[*B, 2]`` float32."""
+"""Throttle in [0, 1], with traffic in [-1, 1] where negative brakes, and steer in [-1, 1] (positive turns right),
+``[*B, 2]`` float32."""
 IMAGE = IMAGE_KEY
 """Dash camera image, ``[*B, C, 88, 200]`` uint8."""
 INSTRUCTION = INSTRUCTION_KEY
@@ -74,10 +76,13 @@ OFF_ROAD = (WORLD, "off_road")
 WRONG_LANE = (WORLD, "wrong_lane")
 """Whether two corners of the footprint are in an oncoming lane outside junctions, ``[*B, 1]`` bool."""
 COLLISION = (WORLD, "collision")
-"""Whether the footprint touches a building, 4 m beyond the road's edge, ``[*B, 1]`` bool."""
+"""Whether the footprint touches a building, 4 m beyond the road's edge, or another car, ``[*B, 1]`` bool."""
 TRAFFIC = (WORLD, "traffic")
 """x, y (m), heading (rad) and speed (m/s) of the other cars of the same world, ``[*B, N, 4]`` float32; rows of NaN hold
 no car. There is none without traffic."""
+RIGHT_OF_WAY = (WORLD, "right_of_way")
+"""Whether no other car is on, or can no longer stop before, a lane that excludes the route's in the next junction,
+``[*B, 1]`` bool. There is none without traffic."""
 
 AGENT = "agent"
 """The agent's own keys; it reads the root's and writes those of the next step."""

@@ -27,6 +27,7 @@ def make_env(
     episodes: Sequence[Episode] | None = None,
     policy: TensorDictModuleBase | None = None,
     max_steps: int = 1000,
+    traffic: int = 0,
     device: torch.device | str = "cpu",
     seed: int = 0,
 ) -> TransformedEnv:
@@ -38,6 +39,7 @@ def make_env(
         episodes: one per row, with their instructions; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         max_steps: length of a roaming episode.
+        traffic: other cars in each world.
         device: where the tensors are.
         seed: of the env and of the instructions.
 
@@ -46,7 +48,7 @@ def make_env(
         ['done', 'end_of_subtask', 'instruction_tokens', 'observation', 'subtask', 'terminated', 'truncated', 'world']
     """
     town = Town.load(town) if isinstance(town, str) else town
-    env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, device=device, seed=seed)
+    env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, traffic=traffic, device=device, seed=seed)
     return _stack(env, town, episodes, policy, seed)
 
 

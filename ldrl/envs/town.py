@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from ldrl import keys
 from ldrl.envs import vehicle
+from ldrl.envs.traffic import Agent, Traffic, random_turn
 from ldrl.subtasks import SubTask
 from ldrl.towns import ROUTE_LANES, Town
 from ldrl.towns.surface import sample
@@ -33,10 +34,14 @@ STANDING_STEPS = 30
 """A car that stands this long has ended its drive."""
 PATIENCE = 15.0
 """Time beyond one and a half times what the path needs at cruise speed before an episode is cut off, s."""
+TRAFFIC_PATIENCE = 2
+"""With traffic an episode may take this many times as long."""
+WAITING_DISTANCE = 25.0
+"""A car that stands may be waiting for another one that is ahead of it and this near, m."""
 
 
 class TownEnv(EnvBase):
-    """Cars that each drive alone through a town: throttle and steer in, their world out, at 10 Hz.
+    """Cars that each drive through a town of their own: throttle and steer in, their world out, at 10 Hz.
 
     A car follows a route: an episode's, or at random over every junction (roaming). The env draws no image and speaks
     no sentence: :class:`~ldrl.envs.DashCamera`, :class:`~ldrl.envs.Instruction` and
@@ -47,17 +52,23 @@ class TownEnv(EnvBase):
     route in the step, in metres. An episode terminates when the footprint reaches the buildings behind the 4 m
     sidewalks (``collision``) or when the car has stood for 3 s; it is truncated after ``max_steps``.
 
+    With ``traffic`` every row is a world with so many other cars, :class:`~ldrl.envs.traffic.Traffic`. Then the
+    throttle is in [-1, 1], where negative brakes, touching another car is a collision, too, and time that the car
+    stands within 25 m of a car ahead of it does not count.
+
     Args:
         town: where to drive.
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: start and path of each car, one per row, instead of roaming.
         max_steps: length of a roaming episode; episodes are given one and a half times the time that their path
-            takes at 20 km/h, and 15 s.
+            takes at 20 km/h, and 15 s; with traffic twice that.
+        traffic: other cars in each world.
         device: where the tensors are.
         seed: of the env's own generator.
 
     Raises:
-        ValueError: no cars, an episode of another town, or one whose start or path is off the road.
+        ValueError: no cars, an episode of another town, one whose start or path is off the road, or more traffic than
+            the streets have room for.
 
     Examples:
         >>> env = TownEnv(Town.load("town1"), num_cars=3)
@@ -72,6 +83,7 @@ class TownEnv(EnvBase):
         *,
         episodes: Sequence[Episode] | None = None,
         max_steps: int = 1000,
+        traffic: int = 0,
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
@@ -85,7 +97,6 @@ class TownEnv(EnvBase):
         self.town = town.to(self.device)
         self.episodes = episodes
         self._generator = torch.Generator(self.device)
-        self._make_specs()
         self.set_seed(seed)
         self._state = torch.zeros(num_cars, 4, dtype=torch.float64, device=self.device)
         self._route = torch.zeros(num_cars, ROUTE_LANES, dtype=torch.long, device=self.device)
@@ -101,8 +112,13 @@ class TownEnv(EnvBase):
         self._planned = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         if episodes is not None:
             self._load(episodes)
+        starts = self.town.points if episodes is None else self._plan_pose[:, :2].float()
+        self._traffic = Traffic(self.town, num_cars, traffic, self._generator, starts) if traffic else None
+        if episodes is not None and traffic:
+            self._limit *= TRAFFIC_PATIENCE
+        self._make_specs(traffic)
 
-    def _make_specs(self) -> None:
+    def _make_specs(self, traffic: int) -> None:
         batch, device = self.batch_size, self.device
 
         def real(*shape: int) -> Unbounded:
@@ -119,8 +135,13 @@ class TownEnv(EnvBase):
             self.observation_spec[key] = real(1)
         for key in (keys.OFF_ROAD, keys.WRONG_LANE, keys.COLLISION):
             self.observation_spec[key] = flag()
+        if traffic:
+            self.observation_spec[keys.TRAFFIC] = real(traffic, 4)
+            self.observation_spec[keys.RIGHT_OF_WAY] = flag()
         self.action_spec = Bounded(
-            torch.tensor([0.0, -1.0]).expand(*batch, 2), torch.tensor([1.0, 1.0]).expand(*batch, 2), device=device
+            torch.tensor([self._least_throttle, -1.0]).expand(*batch, 2),
+            torch.tensor([1.0, 1.0]).expand(*batch, 2),
+            device=device,
         )
         self.reward_spec = real(1)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=batch, device=device)
@@ -141,14 +162,13 @@ class TownEnv(EnvBase):
         if seed is not None:
             self._generator.manual_seed(seed)
 
-    def _uniform(self) -> Tensor:
-        return torch.rand(self.batch_size, generator=self._generator, device=self.device)
+    @property
+    def _least_throttle(self) -> float:
+        return 0.0 if self._traffic is None else -1.0
 
     def _following(self, lane: Tensor, k: Tensor | int) -> Tensor:
         """The lane after ``lane`` of each car's route: the plan's lane ``k``, behind its end a random one."""
-        count = self.town.lane_successor_count[lane]
-        chosen = (self._uniform() * count).long().minimum(count - 1)
-        following = self.town.lane_successors[lane].gather(-1, chosen.unsqueeze(-1)).squeeze(-1)
+        following = random_turn(self.town, lane, self._generator)
         k = torch.as_tensor(k, device=self.device).expand(self.batch_size)
         planned = self._plan.gather(-1, k.clamp(max=self._plan.shape[-1] - 1).unsqueeze(-1)).squeeze(-1)
         return torch.where(k < self._plan_length, planned, following)
@@ -159,7 +179,8 @@ class TownEnv(EnvBase):
             return self._plan[:, 0], self._plan_start, self._plan_pose
         weights = self.town.lane_length[self._on_street]
         lane = self._on_street[weights.multinomial(self.numel(), True, generator=self._generator)]
-        position = self._uniform() * self.town.lane_length[lane]
+        part = torch.rand(self.batch_size, generator=self._generator, device=self.device)
+        position = part * self.town.lane_length[lane]
         point, heading = self.town.sample(lane.unsqueeze(-1).expand(-1, ROUTE_LANES), position.unsqueeze(-1))
         return lane, position, torch.cat((point.squeeze(1), heading), -1).double()
 
@@ -178,17 +199,22 @@ class TownEnv(EnvBase):
         self._progress = self._progress.masked_fill(mask, 0)  # a new tensor: the one before is in the step's output
         self._steps.masked_fill_(mask, 0)
         self._standing.masked_fill_(mask, 0)
+        if self._traffic is not None:
+            self._traffic.reset(mask, self._state[:, :3].float())
         return self._observe()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         moving = tensordict.get("_step", None)
         mask = torch.ones_like(self._steps, dtype=torch.bool) if moving is None else moving.view(self.batch_size)
+        if self._traffic is not None:
+            here = self._state.float()
+            self._traffic.step(mask, Agent(here[:, :3], here[:, 3], self._route, self._position))
         throttle, steer = tensordict[keys.ACTION].double().unbind(-1)
         speed = self._state[:, 3]
         state = vehicle.bicycle_step(
             self._state,
             steer.clamp(-1, 1) * vehicle.MAX_STEERING_ANGLE,
-            vehicle.acceleration(throttle.clamp(0, 1), speed),
+            vehicle.acceleration(throttle.clamp(self._least_throttle, 1), speed),
         )
         return self.follow(torch.where(mask.unsqueeze(-1), state, self._state), mask)
 
@@ -208,9 +234,13 @@ class TownEnv(EnvBase):
         self._state, before = state, self._progress
         self._advance(mask)
         self._steps += mask
-        stands = self._state[:, 3] < STANDING_SPEED
-        self._standing = torch.where(mask, (self._standing + 1) * stands, self._standing)
         out = self._observe()
+        stands = self._state[:, 3] < STANDING_SPEED
+        standing = (self._standing + 1) * stands
+        if self._traffic is not None:
+            waits = self._traffic.any_ahead(out[keys.POSE], WAITING_DISTANCE)
+            standing = torch.where(waits, self._standing * stands, standing)
+        self._standing = torch.where(mask, standing, self._standing)
         out["reward"] = (self._progress - before).unsqueeze(-1)
         terminated = out[keys.COLLISION] | (self._standing >= STANDING_STEPS).unsqueeze(-1)
         truncated = (self._steps >= self._limit).unsqueeze(-1)
@@ -250,4 +280,9 @@ class TownEnv(EnvBase):
         out[keys.OFF_ROAD] = (beyond_edge > 0).any(-1, keepdim=True)
         out[keys.WRONG_LANE] = oncoming.sum(-1, keepdim=True) >= WRONG_LANE_CORNERS
         out[keys.COLLISION] = (beyond_edge > SIDEWALK).any(-1, keepdim=True)
+        if self._traffic is not None:
+            out[keys.TRAFFIC] = self._traffic.state
+            out[keys.RIGHT_OF_WAY] = self._traffic.right_of_way(self._route, self._position).unsqueeze(-1)
+            touching = vehicle.overlap(pose.unsqueeze(1), self._traffic.state[..., :3])
+            out[keys.COLLISION] |= touching.any(-1, keepdim=True)
         return out

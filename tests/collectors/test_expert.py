@@ -1,12 +1,15 @@
-"""The expert: each controller by itself, every built-in episode, and states that it would not have come to."""
+"""The expert: each controller by itself, every built-in episode, states that it would not have come to, and traffic."""
+
+import math
 
 import pytest
 import torch
 
 from ldrl import keys
 from ldrl.collectors.expert import LOOK_AHEAD, Expert, expert_action
-from ldrl.envs import TownEnv
+from ldrl.envs import TownEnv, vehicle
 from ldrl.envs.camera import shift
+from ldrl.envs.following import idm_acceleration
 from ldrl.envs.vehicle import CRUISE_SPEED
 
 FLAGS = (keys.OFF_ROAD, keys.WRONG_LANE, keys.COLLISION)
@@ -80,3 +83,73 @@ def test_labels_do_not_depend_on_the_guess_or_the_batch(town2):
     assert Expert(town2)(td)[keys.ACTION].equal(actions)
     assert (actions[:, 0] >= 0).all()
     assert (actions.abs() <= 1).all()
+
+
+def test_drives_episodes_in_traffic(town, episodes):
+    """Some short ones, among 20 cars: all arrive in time, none touches anything or leaves its lane."""
+    some, expert = sorted(episodes[town.name], key=lambda episode: len(episode.path)), Expert(town)
+    some = some[: len(some) // 2 : 5]
+    env = TownEnv(town, episodes=some, traffic=20, seed={"town1": 1, "town2": 3}[town.name])
+    length = torch.tensor([episode.route(town).length for episode in some])
+    td, live, slowest = env.reset(), torch.ones(len(some), dtype=torch.bool), math.inf
+    while live.any():
+        td = env.step(expert(td.set("_step", live)))["next"]
+        for flag in FLAGS:
+            wrong = td[flag].squeeze(-1) & live
+            assert not wrong.any(), (flag, [some[k].id for k in wrong.nonzero().flatten()])
+        assert not (td["done"].squeeze(-1) & live).any()
+        slowest = min(slowest, float(td[keys.SPEED].squeeze(-1)[live].min()))
+        live = live & (td[keys.PROGRESS].squeeze(-1) < length)
+    assert slowest < 3  # with these seeds somebody has to give way
+
+
+def on_a_street(town, speed, before):
+    """Arguments of ``expert_action`` for a car so many metres before a junction."""
+    approach = next(lane for lane in town.approaches() if town.lane_length[lane] > 80)
+    route = [int(town.lane_predecessor[approach]), approach]
+    while len(route) < 6:
+        route.append(town.successors(route[-1])[0])
+    route, position = torch.tensor([route]), town.lane_length[approach].unsqueeze(0) - before
+    point, heading = town.sample(route, position.unsqueeze(-1))
+    return town, torch.cat((point[:, 0], heading), -1), torch.tensor([speed]), route, position
+
+
+@pytest.mark.parametrize(("speed", "gap", "leader_speed"), [(5.0, 15.0, 2.0), (3.0, 30.0, 5.0), (0.0, 9.0, 0.0)])
+def test_follows_as_an_idm_vehicle(town2, speed, gap, leader_speed):
+    arguments, free = on_a_street(town2, speed, 60.0), torch.tensor([True])
+    x, y, heading = arguments[1][0].tolist()
+    leader = [x + gap * math.cos(heading), y + gap * math.sin(heading), heading, leader_speed]
+    beside = [leader[0] + 4 * math.sin(heading), leader[1] - 4 * math.cos(heading), heading + math.pi, 5.0]
+    nobody = [math.nan] * 4
+    expected = idm_acceleration(*map(torch.tensor, (speed, CRUISE_SPEED, gap, leader_speed)))
+    action = expert_action(*arguments, torch.tensor([[beside, leader, nobody]]), free)
+    reached = vehicle.acceleration(action[0, 0], arguments[2][0])
+    assert float(reached) == pytest.approx(max(float(expected), -speed / vehicle.TIME_STEP), abs=1e-3)
+    alone = expert_action(*arguments, torch.tensor([[beside, nobody]]), free)
+    assert torch.equal(alone, expert_action(*arguments, torch.tensor([[nobody]]), free))
+    assert alone[0, 0] > action[0, 0]
+    assert alone[0, 1] == expert_action(*arguments)[0, 1]
+
+
+@pytest.mark.parametrize(
+    ("before", "right_of_way", "brakes"), [(20.0, False, True), (20.0, True, False), (26.0, False, False)]
+)
+def test_stops_before_a_junction_that_others_have(town2, before, right_of_way, brakes):
+    arguments = on_a_street(town2, 5.0, before)
+    action = expert_action(*arguments, torch.full((1, 1, 4), math.nan), torch.tensor([right_of_way]))
+    assert (vehicle.acceleration(action[0, 0], torch.tensor(5.0)) < 0) == brakes
+
+
+def test_waits_at_the_stop_line(town2):
+    env, expert = TownEnv(town2, 1, traffic=1, seed=0), Expert(town2)
+    td = env.reset()
+    _, pose, _, route, position = on_a_street(town2, 5.0, 24.0)
+    env._route, env._position = route, position
+    env._state[:, :3] = pose.double()
+    td = env._observe()
+    for _ in range(150):
+        td[keys.RIGHT_OF_WAY] = torch.tensor([[False]])
+        td = env.step(expert(td))["next"]
+    to_entry = float(town2.lane_length[route[0, 1]]) - float(td[keys.ROUTE_POSITION])
+    assert 2.5 < to_entry < 4.0
+    assert td[keys.SPEED] < 0.05

@@ -55,6 +55,12 @@ def test_same_seed_same_rollout_and_a_batch_row_alone(town2, episodes):
         assert torch.equal(together[key][1], alone[key][0])
 
 
+def test_traffic(town2):
+    env = make_env(town2, 2, traffic=3)
+    check_env_specs(env)
+    assert env.reset()[keys.TRAFFIC].shape == (2, 3, 4)
+
+
 def test_town_by_name():
     env = make_env("town2", num_cars=1)
     assert env.base_env.town.name == "town2"

@@ -2,8 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from highway_env.utils import are_polygons_intersecting
+from highway_env.vehicle.kinematics import Vehicle
 
 from ldrl.envs import vehicle
 
@@ -40,6 +43,33 @@ def test_rolls_to_a_stop_within_12_metres():
     assert speeds[-1] < 1e-6
 
 
+def test_brake():
+    throttle, speed = torch.tensor([-1.0, -0.5, -1.0, -0.1]), torch.tensor([5.0, 5.0, 0.3, 0.0])
+    assert vehicle.acceleration(throttle, speed).tolist() == pytest.approx([-7.5, -4.5, -3.0, 0.0])
+
+
+def test_full_brake_stops_within_2_3_metres_and_stays():
+    state, brake = torch.tensor([0.0, 0.0, 0.0, 20 / 3.6], dtype=torch.float64), torch.tensor(-1.0).double()
+    speeds = []
+    for _ in range(20):
+        state = vehicle.bicycle_step(state, torch.zeros_like(brake), vehicle.acceleration(brake, state[3]))
+        speeds.append(float(state[3]))
+    assert 2.0 < state[0] < 2.4
+    assert min(speeds) > -1e-12
+    assert speeds[8:] == pytest.approx([0.0] * 12, abs=1e-12)
+
+
+def test_throttle_for_is_the_inverse():
+    throttle = torch.linspace(-1, 1, 41).unsqueeze(-1)
+    speed = torch.tensor([0.3, 1.0, 5.0])
+    acceleration = vehicle.acceleration(throttle, speed)
+    reversing = throttle * vehicle.MAX_BRAKING - (5 * speed).clamp(max=1.5) < -speed / vehicle.TIME_STEP
+    torch.testing.assert_close(
+        vehicle.throttle_for(acceleration, speed)[~reversing], throttle.expand(-1, 3)[~reversing]
+    )
+    assert vehicle.throttle_for(torch.tensor([9.0, -9.0]), torch.tensor(5.0)).tolist() == [1.0, -1.0]
+
+
 def test_speed_is_capped_as_in_highway_env():
     after = vehicle.bicycle_step(torch.tensor([0.0, 0.0, 0.0, 43.0]), torch.tensor(0.0), torch.tensor(5.0))
     assert float(after[3]) == pytest.approx(42.7)
@@ -61,6 +91,27 @@ def test_steer_towards_meets_the_point(forward, right, monkeypatch):
 def test_steer_towards_is_bounded_and_finite():
     forward, right = torch.tensor([0.5, 0.5, 0.0, 3.0]), torch.tensor([2.0, -2.0, 1.0, 0.0])
     assert vehicle.steer_towards(forward, right).tolist() == pytest.approx([1.0, -1.0, 1.0, 0.0])
+
+
+def test_overlap_equals_highway_envs_polygons():
+    generator = np.random.default_rng(0)
+    pose = generator.uniform((-5, -5, -4), (5, 5, 4), (400, 3))
+    found = vehicle.overlap(torch.zeros(3, dtype=torch.float64), torch.tensor(pose))
+    polygons = [Vehicle(None, xy, heading).polygon() for *xy, heading in pose]
+    still = np.zeros(2)
+    first = Vehicle(None, [0.0, 0.0], 0.0).polygon()
+    expected = [are_polygons_intersecting(first, polygon, still, still)[0] for polygon in polygons]
+    assert found.tolist() == expected
+    assert 50 < sum(expected) < 350
+
+
+def test_overlap_with_a_margin_and_nobody():
+    apart, none = torch.tensor([5.4, 0.0, 0.0]), torch.tensor([math.nan] * 3)
+    origin = torch.zeros(3)
+    assert not vehicle.overlap(origin, apart)
+    assert not vehicle.overlap(origin, apart, 0.19)
+    assert vehicle.overlap(origin, apart, 0.21)
+    assert not vehicle.overlap(origin, none, 9.0)
 
 
 def test_footprint():
