@@ -16,12 +16,13 @@ from highway_env.envs.common.observation import ObservationType, observation_fac
 from highway_env.road.road import Road
 from highway_env.vehicle.kinematics import Vehicle
 from tensordict import TensorDictBase
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, TensorSpec
 
 from ldrl import keys
 from ldrl.envs import vehicle as car
 from ldrl.envs.episodes import FIELDS, Episode
-from ldrl.envs.highway_road import IndexedRoad, mark_crossings, spawn
+from ldrl.envs.highway_road import IndexedRoad
+from ldrl.envs.highway_traffic import HighwayTraffic, mark_crossings
 from ldrl.envs.town import TownEnv
 from ldrl.towns import Town
 from ldrl.towns.network import IndexedNetwork
@@ -37,8 +38,7 @@ class ThrottleSteerAction(ActionType):
 
     def space(self) -> Box:
         """Throttle and steer, float32."""
-        braking = -1.0 if self.env.config["vehicles_count"] else 0.0
-        return Box(np.array([braking, -1.0], np.float32), np.ones(2, np.float32))
+        return _box(self.env.cars.action_spec)
 
     @property
     def vehicle_class(self) -> type[Vehicle]:
@@ -55,29 +55,16 @@ class ThrottleSteerAction(ActionType):
 
 
 class TownObservation(ObservationType):
-    """What :class:`~ldrl.envs.TownEnv` tells, as a dictionary: ``observation["world"]["pose"]`` and so on.
-
-    With traffic also ``observation["world"]["traffic"]``: x, y (m), heading (rad) and speed (m/s) of the other cars.
-    """
+    """What :class:`~ldrl.envs.TownEnv` tells, as a dictionary: ``observation["world"]["pose"]`` and so on."""
 
     def space(self) -> Dict:
         """Arrays of the shapes and types of TownEnv's rows."""
-        specs = self.env.cars.observation_spec[keys.WORLD]
-        world: dict[str, Space] = {name: _box(spec) for name, spec in specs.items()}
-        if self.env.config["vehicles_count"]:
-            world[keys.TRAFFIC[-1]] = Box(-np.inf, np.inf, (self.env.config["vehicles_count"], 4), np.float32)
-        return Dict({keys.WORLD: Dict(world)})
+        world = self.env.cars.observation_spec[keys.WORLD]
+        return Dict({keys.WORLD: Dict({name: _box(spec) for name, spec in world.items()})})
 
     def observe(self) -> dict:
         """The world now."""
-        world = {name: value[0].numpy() for name, value in self.env.seen[keys.WORLD].items()}
-        if self.env.config["vehicles_count"]:
-            traffic = np.full((self.env.config["vehicles_count"], 4), np.nan, np.float32)
-            others = [other for other in self.env.road.vehicles if other is not self.observer_vehicle]
-            for row, other in zip(traffic, others, strict=False):
-                row[:] = *other.position, other.heading, other.speed
-            world[keys.TRAFFIC[-1]] = traffic
-        return {keys.WORLD: world}
+        return {keys.WORLD: {name: value[0].numpy() for name, value in self.env.seen[keys.WORLD].items()}}
 
 
 def _box(spec: TensorSpec) -> Box:
@@ -86,7 +73,7 @@ def _box(spec: TensorSpec) -> Box:
     low, high = -np.inf, np.inf
     if spec.dtype == torch.bool:
         low, high = 0, 1
-    elif not spec.dtype.is_floating_point:
+    elif isinstance(spec, Bounded):
         low, high = spec.space.low[0].numpy(), spec.space.high[0].numpy()
     return Box(low, high, example.shape, dtype=example.dtype.type)
 
@@ -151,7 +138,7 @@ class HighwayTownEnv(AbstractEnv):
                 "action": {"type": "ThrottleSteer"},
                 "simulation_frequency": FREQUENCY,
                 "policy_frequency": FREQUENCY,
-                "other_vehicles_type": "ldrl.envs.highway_road.TrafficVehicle",
+                "other_vehicles_type": "ldrl.envs.highway_traffic.TrafficVehicle",
                 "neighbour_vehicles_connected_lanes": True,
                 "screen_width": 600,
                 "screen_height": 600,
@@ -185,7 +172,11 @@ class HighwayTownEnv(AbstractEnv):
         if isinstance(episode, Mapping):
             episode = Episode(**episode)
         episodes = None if episode is None else [episode]
-        self.cars = TownEnv(self.town, 1, episodes=episodes, max_steps=self.config["max_steps"])
+        count, kind = self.config["vehicles_count"], utils.class_from_path(self.config["other_vehicles_type"])
+        self.traffic = HighwayTraffic(self.town, count, kind) if count else None
+        self.cars = TownEnv(
+            self.town, 1, episodes=episodes, max_steps=self.config["max_steps"], traffic=self.traffic or 0
+        )
 
     def define_spaces(self) -> None:
         """Make the spaces and what fills and reads them."""
@@ -199,15 +190,16 @@ class HighwayTownEnv(AbstractEnv):
 
     def _reset(self) -> None:
         self.cars.set_seed(int(self.np_random.integers(2**31)))
-        self.seen = self.cars.reset()
-        x, y, heading, speed = self.cars.state[0].tolist()
         if self.config["indexed"]:
             self.road = IndexedRoad(self.network, np_random=self.np_random)
         else:
             self.road = Road(self.town.network, np_random=self.np_random)
+        if self.traffic is not None:
+            self.traffic.road = self.road
+        self.seen = self.cars.reset()  # which puts the traffic on the road
+        x, y, heading, speed = self.cars.state[0].tolist()
         self.vehicle = self.action_type.vehicle_class(self.road, [x, y], heading, speed)
-        self.road.vehicles.append(self.vehicle)
-        spawn(self.road, self.config["vehicles_count"], utils.class_from_path(self.config["other_vehicles_type"]))
+        self.road.vehicles.insert(0, self.vehicle)
 
     def _simulate(self, action: Any = None) -> None:
         super()._simulate(action)

@@ -166,12 +166,12 @@ def test_torchrls_contract(town2):
         assert env.batch_size == ()
         least = [-1.0 if count else 0.0, -1.0]
         assert env.action_spec.space.low.tolist() == least
-        twin = TownEnv(town2, 1).reset()
+        twin = TownEnv(town2, 1, traffic=count).reset()
         td = env.reset()
         for key in twin.keys(True, True):
             assert td[key].dtype == twin[key].dtype, key
             assert td[key].shape == twin[key].shape[1:], key
-        assert (keys.TRAFFIC in td.keys(True)) == (count > 0)
+        assert set(map(str, td.keys(True, True))) == set(map(str, twin.keys(True, True)))
     assert td[keys.TRAFFIC].shape == (3, 4)
     assert td[keys.TRAFFIC].dtype == torch.float32
     assert td[keys.TRAFFIC].isfinite().all()
@@ -185,11 +185,10 @@ def test_the_usual_stack(town2, episodes, policy):
         check_env_specs(env)
         with torch.no_grad():
             rollout = env.rollout(4, policy)
-        expected = make_env(town2, None if episode else 1, episodes=episode and [episode], policy=policy).rollout(
-            4, policy
-        )
+        given = {"episodes": [episode]} if episode else {"num_cars": 1}
+        expected = make_env(town2, **given, policy=policy, traffic=2).rollout(4, policy)
         names = set(map(str, rollout.keys(True, True)))
-        assert names - {str(keys.TRAFFIC), str(("next", *keys.TRAFFIC))} == set(map(str, expected.keys(True, True)))
+        assert names == set(map(str, expected.keys(True, True)))
         for key in expected.keys(True, True):
             assert rollout[key].shape == expected[key].shape[1:], key
             assert rollout[key].dtype == expected[key].dtype, key
@@ -206,11 +205,15 @@ def test_side_by_side(town2):
     assert env.rollout(3)[keys.IMAGE].shape == (2, 3, 1, 88, 200)
 
 
-def test_the_expert_drives_an_episode(town2, episodes):
-    env = make_highway_env(town2, episode=episodes["town2"][60], policy=Expert(town2))
-    rollout = env.rollout(1000, Expert(town2))
-    assert rollout["next", keys.REMAINING].min() < 1
-    assert not rollout["next", keys.OFF_ROAD].any()
+@pytest.mark.parametrize("vehicles_count", [0, 20])
+def test_the_expert_drives_episodes(town2, episodes, vehicles_count):
+    expert = Expert(town2)
+    for episode in episodes["town2"][60:150:30]:
+        env = make_highway_env(town2, episode=episode, policy=expert, config={"vehicles_count": vehicles_count})
+        rollout = env.rollout(1000, expert)
+        assert rollout["next", keys.REMAINING].min() < 1
+        assert not rollout["next", keys.OFF_ROAD].any()
+        assert not rollout["next", keys.COLLISION].any()
 
 
 def test_traffic_is_where_the_cars_are(env):

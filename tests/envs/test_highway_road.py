@@ -9,10 +9,13 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
 
-from ldrl.envs.highway_road import IndexedRoad, TrafficVehicle, mark_crossings, spawn
+from ldrl.envs.highway_road import IndexedRoad
+from ldrl.envs.highway_traffic import TrafficVehicle, mark_crossings, spawn
 from ldrl.subtasks import SubTask
 from ldrl.towns import load_layout
 from ldrl.towns.network import IndexedNetwork
+
+FAR_AWAY = (-500.0, -500.0, 0.0)
 
 
 @pytest.fixture(scope="module", params=("town1", "town2"))
@@ -33,7 +36,7 @@ def make_road(network, cars=0, *, indexed=True, vehicle_class=TrafficVehicle, se
     rng = np.random.default_rng(seed)
     road = IndexedRoad(IndexedNetwork(network.graph), np_random=rng) if indexed else Road(network, np_random=rng)
     road.neighbour_vehicles_connected_lanes = True
-    spawn(road, cars, vehicle_class)
+    spawn(road, cars, vehicle_class, FAR_AWAY)
     return road
 
 
@@ -182,11 +185,12 @@ def test_a_car_gives_way_to_one_that_crosses(town2):
 
 
 def test_cars_start_apart_and_do_not_touch(town2):
+    lane = town2.get_lane(junction(town2)[SubTask.STRAIGHT])
+    agent = (*lane.position(0, 0), lane.heading_at(0))
     for seed in range(5):
         road = make_road(town2, seed=seed)
-        lane = town2.get_lane(junction(town2)[SubTask.STRAIGHT])
-        road.vehicles.append(Vehicle(road, lane.position(0, 0), lane.heading_at(0), 4.7))
-        spawn(road, 60, TrafficVehicle)
+        spawn(road, 60, TrafficVehicle, agent)
+        road.vehicles.append(Vehicle(road, agent[:2], agent[2], 4.7))
         start = states(road)
         assert len(start) == 61
         apart = np.hypot(*(start[:, None, :2] - start[:, :2]).transpose(2, 0, 1)) + 100 * np.eye(61)
