@@ -20,7 +20,7 @@ STOP_DISTANCE = vehicle.LENGTH / 2 + 1.0
 """From the entry back to the centre of a car at the stop line, m."""
 CLEAR_DISTANCE = vehicle.LENGTH / 2 + 0.5
 """A car has left a junction when its centre is this far past the exit, m."""
-SAFE_BRAKING = 3.0
+SAFE_BRAKING = 2.0
 """A car that would have to brake harder than this to stay out goes in, m/s^2."""
 SIDE_GAP = 0.25
 """Lanes exclude one another if cars on them come closer than twice this, m."""
@@ -53,9 +53,9 @@ def distance_to_stop_line(to_entry: Tensor, may_enter: Tensor) -> Tensor:
         may_enter: ``[*B]`` bool.
 
     Returns:
-        ``[*B]``, infinite for cars that may enter, are far from the junction or already have their nose in it, m.
+        ``[*B]``, infinite for cars that may enter or are far from the junction, m.
     """
-    stops = ~may_enter & (to_entry < CLAIM_DISTANCE) & (to_entry > vehicle.LENGTH / 2)
+    stops = ~may_enter & (to_entry < CLAIM_DISTANCE)
     return (to_entry - STOP_DISTANCE + JAM_DISTANCE).masked_fill(~stops, math.inf)
 
 

@@ -105,7 +105,7 @@ def test_distances_to_the_entry_and_the_stop_line(crossing):
     inside = torch.cat((route[:, 1:], route[:, -1:]), -1)
     assert distance_to_entry(crossing, inside, torch.ones(4)).tolist() == [math.inf] * 4
     stays = distance_to_stop_line(before, torch.zeros(4, dtype=torch.bool))
-    assert stays.tolist() == [math.inf, 26.5, 10.0, math.inf]  # 10 m is where a standing follower stands
+    assert stays.tolist() == [math.inf, 26.5, 10.0, 8.5]  # 10 m is where a standing follower stands
     assert distance_to_stop_line(before, torch.ones(4, dtype=torch.bool)).tolist() == [math.inf] * 4
 
 
@@ -174,9 +174,9 @@ def test_the_agent_goes_first_unless_it_stands(crossing):
 
 
 def test_a_car_that_can_no_longer_stop_keeps_its_right_of_way(crossing):
-    """At 5 m/s it needs 4.2 m at 3 m/s^2, from its nose to the entry."""
+    """At 5 m/s it needs 6.25 m at 2 m/s^2, from its nose to the entry."""
     approach = through(crossing, "east", "west")[0]
-    for before, goes in ((6.2, True), (9.0, False)):
+    for before, goes in ((8.6, True), (8.9, False)):
         traffic = place(crossing, [("east", "west", before, 5.0)])
         traffic._may_enter[:] = True
         other = agent(crossing, "south", "north", 15.0, 5.0)
@@ -184,6 +184,7 @@ def test_a_car_that_can_no_longer_stop_keeps_its_right_of_way(crossing):
         for _ in range(40):
             traffic.step(EVERY, other)
         assert (int(traffic._route[0, 0, 1]) != approach) == goes
+        assert goes or traffic._position[0, 0] + 2.5 < crossing.lane_length[approach]
 
 
 def test_the_agents_right_of_way(crossing):
