@@ -196,11 +196,11 @@ class HighwayTraffic(Traffic):
     @property
     def state(self) -> Tensor:
         """``[1, N, 4]`` float32: x, y (m), heading (rad) and speed (m/s); NaN for cars that have left the road."""
-        rows = torch.full((1, self.count, 4), math.nan)
-        for row, car in zip(rows[0], self.cars, strict=False):
+        rows = [[math.nan] * 4] * self.count
+        for k, car in enumerate(self.cars):
             if car in self.road.vehicles:
-                row[:] = torch.tensor([*car.position, car.heading, car.speed])
-        return rows
+                rows[k] = [*car.position.tolist(), car.heading, car.speed]
+        return torch.tensor([rows], dtype=torch.float32)
 
     def reset(self, mask: Tensor, agent_pose: Tensor) -> None:
         """Put cars on the road, which is empty.
