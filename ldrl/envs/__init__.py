@@ -2,7 +2,8 @@
 
 from ldrl.envs.camera import DashCamera
 from ldrl.envs.episodes import Episode, builtin_episodes, load_episodes, save_episodes
-from ldrl.envs.factory import make_env
+from ldrl.envs.factory import make_env, make_highway_env
+from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
 from ldrl.envs.town import TownEnv
@@ -10,11 +11,13 @@ from ldrl.envs.town import TownEnv
 __all__ = [
     "DashCamera",
     "Episode",
+    "HighwayTownEnv",
     "Instruction",
     "SubtaskLabels",
     "TownEnv",
     "builtin_episodes",
     "load_episodes",
     "make_env",
+    "make_highway_env",
     "save_episodes",
 ]

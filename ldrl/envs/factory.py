@@ -6,17 +6,18 @@ from collections.abc import Sequence
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import Compose, EnvBase, GymWrapper, InitTracker, TransformedEnv
 
 from ldrl import keys
 from ldrl.envs.camera import DashCamera
 from ldrl.envs.episodes import Episode
+from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
 from ldrl.envs.town import TownEnv
 from ldrl.towns import Town
 
-__all__ = ["make_env"]
+__all__ = ["make_env", "make_highway_env"]
 
 
 def make_env(
@@ -48,10 +49,47 @@ def make_env(
     """
     town = Town.load(town) if isinstance(town, str) else town
     env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, traffic=traffic, device=device, seed=seed)
+    return _stack(env, town, episodes, policy, seed)
+
+
+def make_highway_env(
+    town: str | Town,
+    *,
+    episode: Episode | None = None,
+    policy: TensorDictModuleBase | None = None,
+    config: dict | None = None,
+    seed: int = 0,
+) -> TransformedEnv:
+    """The same on highway-env: one car, batch size ``[]``.
+
+    Args:
+        town: a town or the name of one.
+        episode: with its instruction; None roams and draws training sentences.
+        policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
+        config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
+        seed: of the env and of the instructions.
+
+    Examples:
+        >>> make_highway_env("town1", config={"vehicles_count": 3}).reset()["world", "traffic"].shape
+        torch.Size([3, 4])
+    """
+    town = Town.load(town) if isinstance(town, str) else town
+    env = GymWrapper(HighwayTownEnv({"town": town, "episode": episode} | (config or {})))
+    env.set_seed(seed)
+    return _stack(env, town, None if episode is None else [episode], policy, seed)
+
+
+def _stack(
+    env: EnvBase,
+    town: Town,
+    episodes: Sequence[Episode] | None,
+    policy: TensorDictModuleBase | None,
+    seed: int,
+) -> TransformedEnv:
     said = None if episodes is None else [episode.instruction for episode in episodes]
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
-        transforms.append(DashCamera(town).to(device))
+        transforms.append(DashCamera(town).to(env.device))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms += [InitTracker(), policy.make_tensordict_primer()]
     return TransformedEnv(env, Compose(*transforms))

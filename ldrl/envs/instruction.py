@@ -85,7 +85,7 @@ class Instruction(Transform):
         batch = next_tensordict.batch_size
         next_tensordict[keys.INSTRUCTION_TOKENS] = self._tokens.view(*batch, -1)
         if self.text:
-            next_tensordict[keys.INSTRUCTION] = NonTensorStack(*self._said).view(batch)
+            next_tensordict[keys.INSTRUCTION] = NonTensorStack(*self._said).view(batch) if batch else self._said[0]
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

@@ -62,7 +62,7 @@ class TownEnv(EnvBase):
         episodes: start and path of each car, one per row, instead of roaming.
         max_steps: length of a roaming episode; episodes are given one and a half times the time that their path
             takes at 20 km/h, and 15 s; with traffic twice that.
-        traffic: other cars in each world.
+        traffic: other cars in each world: how many, or where they come from.
         device: where the tensors are.
         seed: of the env's own generator.
 
@@ -83,7 +83,7 @@ class TownEnv(EnvBase):
         *,
         episodes: Sequence[Episode] | None = None,
         max_steps: int = 1000,
-        traffic: int = 0,
+        traffic: int | Traffic = 0,
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
@@ -113,12 +113,16 @@ class TownEnv(EnvBase):
         if episodes is not None:
             self._load(episodes)
         starts = self.town.points if episodes is None else self._plan_pose[:, :2].float()
-        self._traffic = Traffic(self.town, num_cars, traffic, self._generator, starts) if traffic else None
+        self._traffic: Traffic | None = None
+        if isinstance(traffic, Traffic):
+            self._traffic = traffic
+        elif traffic:
+            self._traffic = Traffic(self.town, num_cars, traffic, self._generator, starts)
         if episodes is not None and traffic:
             self._limit *= TRAFFIC_PATIENCE
-        self._make_specs(traffic)
+        self._make_specs()
 
-    def _make_specs(self, traffic: int) -> None:
+    def _make_specs(self) -> None:
         batch, device = self.batch_size, self.device
 
         def real(*shape: int) -> Unbounded:
@@ -135,8 +139,8 @@ class TownEnv(EnvBase):
             self.observation_spec[key] = real(1)
         for key in (keys.OFF_ROAD, keys.WRONG_LANE, keys.COLLISION):
             self.observation_spec[key] = flag()
-        if traffic:
-            self.observation_spec[keys.TRAFFIC] = real(traffic, 4)
+        if self._traffic is not None:
+            self.observation_spec[keys.TRAFFIC] = real(*self._traffic.state.shape[1:])
             self.observation_spec[keys.RIGHT_OF_WAY] = flag()
         self.action_spec = Bounded(
             torch.tensor([self._least_throttle, -1.0]).expand(*batch, 2),
@@ -216,8 +220,22 @@ class TownEnv(EnvBase):
             steer.clamp(-1, 1) * vehicle.MAX_STEERING_ANGLE,
             vehicle.acceleration(throttle.clamp(self._least_throttle, 1), speed),
         )
-        self._state = torch.where(mask.unsqueeze(-1), state, self._state)
-        before = self._progress
+        return self.follow(torch.where(mask.unsqueeze(-1), state, self._state), mask)
+
+    @property
+    def state(self) -> Tensor:
+        """``[B, 4]`` float64: x, y (m), heading (rad), speed (m/s)."""
+        return self._state
+
+    def follow(self, state: Tensor, mask: Tensor | None = None) -> TensorDictBase:
+        """What a step gives out when the cars have come to a state, be it by another simulator's physics.
+
+        Args:
+            state: ``[B, 4]`` float64, 0.1 s after the last one: x, y (m), heading (rad), speed (m/s).
+            mask: ``[B]`` bool, the cars that were to move; None for all.
+        """
+        mask = torch.ones_like(self._steps, dtype=torch.bool) if mask is None else mask
+        self._state, before = state, self._progress
         self._advance(mask)
         self._steps += mask
         out = self._observe()

@@ -189,7 +189,7 @@ class Traffic:
         Returns:
             ``[W]`` bool.
         """
-        offset = self._path[:, :, 0, :2] - pose[:, None, :2]
+        offset = self.state[..., :2] - pose[:, None, :2]
         direction = torch.stack((pose[:, 2].cos(), pose[:, 2].sin()), -1).unsqueeze(1)
         return (((offset * direction).sum(-1) > 0) & (offset.norm(dim=-1) < distance)).any(-1)
 
