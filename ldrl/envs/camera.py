@@ -17,8 +17,9 @@ from ldrl.envs.sight import HEIGHT, HORIZON, STEMS_IN_SIGHT, WIDTH, Mount, Sight
 from ldrl.towns import Town
 from ldrl.towns.ground import Material
 
-__all__ = ["DashCamera", "shift"]
+__all__ = ["DashCamera", "Modality", "shift"]
 
+Modality = Literal["gs", "rgb"]
 CHANNELS = {"gs": 1, "rgb": 3}
 """Channels of the image in each modality."""
 FRAMES_AT_ONCE = 32
@@ -77,7 +78,7 @@ class DashCamera(Transform):
         self,
         town: Town,
         *,
-        modality: Literal["gs", "rgb"] = "gs",
+        modality: Modality = "gs",
         appearance: str | int = "clear",
         lateral: float = 0.0,
         yaw: float = 0.0,

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, GymWrapper, InitTracker, TransformedEnv
 
 from ldrl import keys
-from ldrl.envs.camera import DashCamera
+from ldrl.envs.camera import DashCamera, Modality
 from ldrl.envs.episodes import Episode
 from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
@@ -26,6 +26,8 @@ def make_env(
     *,
     episodes: Sequence[Episode] | None = None,
     policy: TensorDictModuleBase | None = None,
+    modality: Modality = "gs",
+    appearance: str | int = "clear",
     max_steps: int = 1000,
     traffic: int = 0,
     device: torch.device | str = "cpu",
@@ -38,10 +40,12 @@ def make_env(
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: one per row, with their instructions; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
+        modality: of the images, ``"gs"`` or ``"rgb"``.
+        appearance: of rgb images, see :class:`~ldrl.envs.DashCamera`.
         max_steps: length of a roaming episode.
         traffic: other cars in each world.
         device: where the tensors are.
-        seed: of the env and of the instructions.
+        seed: of the env, the instructions and the appearances.
 
     Examples:
         >>> sorted(make_env("town1", num_cars=2).reset().keys())
@@ -49,7 +53,7 @@ def make_env(
     """
     town = Town.load(town) if isinstance(town, str) else town
     env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, traffic=traffic, device=device, seed=seed)
-    return _stack(env, town, episodes, policy, seed)
+    return _stack(env, town, episodes, policy, modality, appearance, seed)
 
 
 def make_highway_env(
@@ -57,6 +61,8 @@ def make_highway_env(
     *,
     episode: Episode | None = None,
     policy: TensorDictModuleBase | None = None,
+    modality: Modality = "gs",
+    appearance: str | int = "clear",
     config: dict | None = None,
     seed: int = 0,
 ) -> TransformedEnv:
@@ -66,6 +72,8 @@ def make_highway_env(
         town: a town or the name of one.
         episode: with its instruction; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
+        modality: of the images, ``"gs"`` or ``"rgb"``.
+        appearance: of rgb images, see :class:`~ldrl.envs.DashCamera`.
         config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
         seed: of the env and of the instructions.
 
@@ -76,7 +84,7 @@ def make_highway_env(
     town = Town.load(town) if isinstance(town, str) else town
     env = GymWrapper(HighwayTownEnv({"town": town, "episode": episode} | (config or {})))
     env.set_seed(seed)
-    return _stack(env, town, None if episode is None else [episode], policy, seed)
+    return _stack(env, town, None if episode is None else [episode], policy, modality, appearance, seed)
 
 
 def _stack(
@@ -84,12 +92,15 @@ def _stack(
     town: Town,
     episodes: Sequence[Episode] | None,
     policy: TensorDictModuleBase | None,
+    modality: Modality,
+    appearance: str | int,
     seed: int,
 ) -> TransformedEnv:
     said = None if episodes is None else [episode.instruction for episode in episodes]
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
-        transforms.append(DashCamera(town).to(env.device))
+        camera = DashCamera(town, modality=modality, appearance=appearance, seed=seed)
+        transforms.append(camera.to(env.device))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms += [InitTracker(), policy.make_tensordict_primer()]
     return TransformedEnv(env, Compose(*transforms))

@@ -78,9 +78,10 @@ class Mount(NamedTuple):
         """Map coordinates of the points ``rays``, ``[2, R]`` metres ahead and to the right: two ``[N, R]``."""
         start = (self.xy - origin) * per_metre
         cos, sin = self.cos * per_metre, self.sin * per_metre
-        shape = (len(start), rays.shape[1])
-        x = torch.addmm(start[:, :1].expand(shape), torch.cat((cos, -sin), 1), rays)
-        y = torch.addmm(start[:, 1:].expand(shape), torch.cat((sin, cos), 1), rays)
+        ahead, right = rays
+        # No matrix product: its rounding would depend on how many cameras there are.
+        x = (cos * ahead).addcmul_(-sin, right).add_(start[:, :1])
+        y = (sin * ahead).addcmul_(cos, right).add_(start[:, 1:])
         return x, y
 
 

@@ -17,6 +17,7 @@ from ldrl.envs import vehicle
 from ldrl.envs.traffic import Agent, Traffic, random_turn
 from ldrl.subtasks import SubTask
 from ldrl.towns import ROUTE_LANES, Town
+from ldrl.towns.ground import SIDEWALK
 from ldrl.towns.surface import sample
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TownEnv"]
 
-SIDEWALK = 4.0
-"""Width of the sidewalk between the road and the buildings, m."""
 WRONG_LANE_CORNERS = 2
 """Corners of the footprint in an oncoming lane that make the car drive in the wrong lane."""
 STANDING_SPEED = 0.1

@@ -6,7 +6,7 @@ from torchrl.envs.utils import check_env_specs
 
 from ldrl import keys
 from ldrl.collectors.expert import Expert
-from ldrl.envs import DashCamera, make_env
+from ldrl.envs import DashCamera, make_env, make_highway_env
 from ldrl.language import Tokenizer
 from ldrl.modules import HierarchicalAgent
 
@@ -66,3 +66,28 @@ def test_town_by_name():
     assert env.base_env.town.name == "town2"
     with pytest.raises(ValueError, match=r"'atlantis'.*town1, town2"):
         make_env("atlantis", num_cars=1)
+
+
+@pytest.mark.parametrize("modality", ["gs", "rgb"])
+@pytest.mark.parametrize("world", ["town", "highway"])
+def test_other_cars_are_in_the_picture(town2, world, modality):
+    if world == "town":
+        env = make_env(town2, 1, traffic=20, modality=modality, seed=1)
+    else:
+        env = make_highway_env(town2, config={"vehicles_count": 20}, modality=modality, seed=1)
+    images = env.rollout(60, Expert(town2), break_when_any_done=False)
+    camera = DashCamera(town2, modality=modality)
+    assert torch.equal(images[keys.IMAGE], camera.draw(images[keys.POSE], images[keys.TRAFFIC]))
+    empty = camera.draw(images[keys.POSE])
+    differs = (images[keys.IMAGE] != empty).flatten(-3).any(-1)
+    assert differs.any()
+    if modality == "gs":
+        assert (images[keys.IMAGE] <= empty).all()  # cars only hide
+
+
+def test_appearance_per_episode(town2):
+    env, again = (make_env(town2, 3, modality="rgb", appearance="episode", seed=5) for _ in range(2))
+    td = env.reset()
+    assert td[keys.IMAGE].shape == (3, 3, 88, 200)
+    assert torch.equal(td[keys.APPEARANCE], again.reset()[keys.APPEARANCE])
+    check_env_specs(env)
