@@ -22,8 +22,8 @@ __all__ = ["DashCamera", "Modality", "shift"]
 Modality = Literal["gs", "rgb"]
 CHANNELS = {"gs": 1, "rgb": 3}
 """Channels of the image in each modality."""
-FRAMES_AT_ONCE = 32
-"""Frames drawn together: few enough that their rays stay in the processor's cache."""
+FRAMES_AT_ONCE = {"cpu": 32, "cuda": 2048}
+"""Frames drawn together: on a processor so few that their rays stay in its cache, on a GPU as many as keep it busy."""
 
 
 def shift(pose: Tensor, lateral: Tensor | float, yaw: Tensor | float) -> Tensor:
@@ -121,8 +121,9 @@ class DashCamera(Transform):
         traffic = None if traffic is None else traffic.reshape(len(pose), -1, 4)
         look = self._look(len(pose), number) if self.modality == "rgb" else None
         images = pose.new_empty((len(pose), CHANNELS[self.modality], HEIGHT, WIDTH), dtype=torch.uint8)
-        for first in range(0, len(pose), FRAMES_AT_ONCE):
-            rows = slice(first, first + FRAMES_AT_ONCE)
+        at_once = FRAMES_AT_ONCE["cpu" if pose.device.type == "cpu" else "cuda"]
+        for first in range(0, len(pose), at_once):
+            rows = slice(first, first + at_once)
             mount, others = Mount.on(pose[rows]), None if traffic is None else traffic[rows]
             if look is None:
                 images[rows, 0, :HORIZON] = 0
