@@ -67,8 +67,7 @@ class StockTown(AbstractEnv):
     def _reset(self) -> None:
         town = self.config["town"]
         self.road = Road(town.network, np_random=self.np_random)
-        streets = (town.lane_manoeuvre == SubTask.LANEFOLLOW).nonzero().flatten().tolist()
-        starts = self.np_random.permutation(streets)[: 1 + self.config["vehicles_count"]]
+        starts = self.np_random.permutation(streets(town))[: 1 + self.config["vehicles_count"]]
         for k, lane in enumerate(starts):
             kind = IDMVehicle if k else self.action_type.vehicle_class
             middle = float(town.lane_length[lane]) / 2
@@ -84,6 +83,11 @@ class StockTown(AbstractEnv):
 
     def _is_truncated(self) -> bool:
         return False
+
+
+def streets(town: Town) -> list[int]:
+    """Its lanes outside junctions."""
+    return (town.lane_manoeuvre == SubTask.LANEFOLLOW).nonzero().flatten().tolist()
 
 
 def gymnasium_row(what: str, env: gymnasium.Env, action: list[float], compared_with: str) -> Row:
@@ -112,13 +116,14 @@ def with_camera(env: TownEnv, modality: str = "gs") -> TransformedEnv:
 
 def rows(device: str) -> list[Row]:
     """All rows; one that others are compared with comes before them."""
-    town1, large = Town.load("town1"), random_town(0, blocks=70)
+    town1, large = Town.load("town1"), random_town(0, blocks=90)
     crowded, gs, stock_road = (
         f"highway-env, {TRAFFIC} IDM cars",
         "TownEnv, gs",
         f"ldrl/Town1-v0, {TRAFFIC} cars, stock road",
     )
-    times = len(large.lane_length) / len(town1.lane_length)
+    gs_batches = BATCHES if device == "cpu" else (*BATCHES, 4096)
+    times = len(streets(large)) / len(streets(town1))
 
     def cars(count: int, town: Town = town1, **settings: int) -> TownEnv:
         return TownEnv(town, count, device=device, seed=0, max_steps=10**9, **settings)
@@ -130,10 +135,17 @@ def rows(device: str) -> list[Row]:
         gymnasium_row("highway-env", StockTown({"town": town1}), [0.0, 0.0], "highway-env x1"),
         gymnasium_row(crowded, StockTown({"town": town1, "vehicles_count": TRAFFIC}), [0.0, 0.0], f"{crowded} x1"),
         *[batched_row("TownEnv", cars(n), "highway-env x1") for n in BATCHES],
-        *[batched_row(gs, with_camera(cars(n)), "highway-env x1") for n in BATCHES],
+        *[batched_row(gs, with_camera(cars(n)), "highway-env x1") for n in gs_batches],
         *[batched_row("TownEnv, rgb", with_camera(cars(n), "rgb"), "highway-env x1") for n in BATCHES],
-        batched_row(f"{gs}, town of {times:.1f} times the lanes", with_camera(cars(WORLDS, large)), f"{gs} x{WORLDS}"),
+        batched_row(
+            f"{gs}, town of {times:.0f} times the streets", with_camera(cars(WORLDS, large)), f"{gs} x{WORLDS}"
+        ),
         batched_row(f"{gs}, {TRAFFIC} cars each", with_camera(cars(WORLDS, traffic=TRAFFIC)), f"{crowded} x1"),
+        batched_row(
+            f"{gs}, {TRAFFIC} cars each, {times:.0f} times the streets",
+            with_camera(cars(WORLDS, large, traffic=TRAFFIC)),
+            f"{gs}, {TRAFFIC} cars each x{WORLDS}",
+        ),
         gymnasium_row(stock_road, indexed(False), [0.3, 0.0], f"{crowded} x1"),
         gymnasium_row(f"ldrl/Town1-v0, {TRAFFIC} cars", indexed(True), [0.3, 0.0], f"{stock_road} x1"),
     ]

@@ -83,21 +83,19 @@ _FACADES = torch.tensor(
 _CARS = torch.tensor([[0.75, 0.1, 0.1], [0.15, 0.25, 0.6], [0.85, 0.85, 0.87], [0.12, 0.12, 0.13], [0.55, 0.56, 0.58]])
 
 
-def appearance_number(scenery: int | Tensor, weather: str | int | Tensor) -> int | Tensor:
+def appearance_number(scenery: int, weather: str) -> int:
     """The number of the appearance with given materials under given weather.
 
     Args:
         scenery: at least 0; what the materials' colours are drawn from.
-        weather: one of ``WEATHERS`` or its index.
+        weather: one of ``WEATHERS``.
 
     Raises:
         ValueError: there is no such weather.
     """
-    if isinstance(weather, str):
-        if weather not in WEATHERS:
-            raise ValueError(f"weather {weather!r} is unknown; use one of {', '.join(WEATHERS)}")
-        weather = WEATHERS.index(weather)
-    return scenery * len(WEATHERS) + weather
+    if weather not in WEATHERS:
+        raise ValueError(f"weather {weather!r} is unknown; use one of {', '.join(WEATHERS)}")
+    return scenery * len(WEATHERS) + WEATHERS.index(weather)
 
 
 def looks(number: Tensor) -> Look:
@@ -135,7 +133,7 @@ def looks(number: Tensor) -> Look:
 
 
 def band_depths(device: torch.device | str = "cpu") -> Tensor:
-    """Where the haze of each band is taken, ``[8]``, m: 4 m and half as far again each time."""
+    """Where the haze of each band is taken, ``[8]``, m: 4 m and 1.6 times as far each time."""
     return 4 * 1.6 ** torch.arange(BANDS, device=device)
 
 

@@ -20,6 +20,7 @@ from ldrl.towns.ground import Material
 __all__ = ["DashCamera", "Modality", "shift"]
 
 Modality = Literal["gs", "rgb"]
+MOST_APPEARANCES = 1 << 60
 CHANNELS = {"gs": 1, "rgb": 3}
 """Channels of the image in each modality."""
 FRAMES_AT_ONCE = {"cpu": 32, "cuda": 2048}
@@ -58,10 +59,11 @@ class DashCamera(Transform):
             drivable surface first; or ``"rgb"``.
         appearance: of rgb images. One of ``WEATHERS``: the town's own materials in that weather. A number: other
             materials and weather, the same for the same number. ``"episode"``: a new number at each reset, kept in
-            ``("world", "appearance")``. ``"sample"``: a new number for each image.
+            ``("world", "appearance")`` and read from there in a replay buffer. ``"sample"``: a new number for each
+            image.
         lateral: offset of the mount to the right, m.
         yaw: turn of the mount to the right, rad.
-        seed: of the numbers drawn.
+        seed: of the numbers drawn; parallel workers need one each, for ``env.set_seed`` does not reach it.
 
     Raises:
         ValueError: an unknown modality or appearance.
@@ -73,6 +75,10 @@ class DashCamera(Transform):
         >>> DashCamera(Town.load("town2"), modality="rgb", appearance="sunset").draw(torch.zeros(5, 3)).shape
         torch.Size([5, 3, 88, 200])
     """
+
+    _numbers: Tensor
+    colours: Tensor
+    sun: Tensor
 
     def __init__(
         self,
@@ -97,13 +103,14 @@ class DashCamera(Transform):
         if isinstance(appearance, str):
             drawn = appearance in ("episode", "sample")
             number = 0 if drawn else appearance_number(self.scenery.seed, appearance)
-        elif appearance >= 0:
+        elif type(appearance) is int and 0 <= appearance < MOST_APPEARANCES:
             number = appearance
         else:
-            raise ValueError(f"appearance {appearance} is negative; use a number from 0 on or one of {WEATHERS}")
+            choices = f"a number from 0 to 2**60 - 1, 'episode', 'sample' or one of {', '.join(WEATHERS)}"
+            raise ValueError(f"appearance is {appearance!r}; use {choices}")
         for name, value in looks(torch.tensor([number]))._asdict().items():
             self.register_buffer(name, value, persistent=False)
-        self._numbers = torch.zeros(0, dtype=torch.long)
+        self.register_buffer("_numbers", torch.zeros(0, dtype=torch.long), persistent=False)
 
     def draw(self, pose: Tensor, traffic: Tensor | None = None, number: Tensor | None = None) -> Tensor:
         """Draw images.
@@ -118,7 +125,7 @@ class DashCamera(Transform):
         """
         batch = pose.shape[:-1]
         pose = shift(pose, self.lateral, self.yaw).reshape(-1, 3)
-        traffic = None if traffic is None else traffic.reshape(len(pose), -1, 4)
+        traffic = None if traffic is None or not traffic.shape[-2] else traffic.reshape(-1, *traffic.shape[-2:])
         look = self._look(len(pose), number) if self.modality == "rgb" else None
         images = pose.new_empty((len(pose), CHANNELS[self.modality], HEIGHT, WIDTH), dtype=torch.uint8)
         at_once = FRAMES_AT_ONCE["cpu" if pose.device.type == "cpu" else "cuda"]
@@ -153,11 +160,22 @@ class DashCamera(Transform):
         return road.neg_().bitwise_and_(hidden.bitwise_not_().to(torch.uint8))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self.appearance == "episode" and keys.APPEARANCE not in next_tensordict.keys(True):
-            next_tensordict[keys.APPEARANCE] = self._numbers.view(*next_tensordict.batch_size, 1)
-        number = next_tensordict.get(keys.APPEARANCE, None)
+        number = None
+        if self.appearance == "episode":
+            number = next_tensordict.get(keys.APPEARANCE, None)
+            if number is None:
+                number = self._episodes_numbers(next_tensordict)
         image = self.draw(next_tensordict[keys.POSE], next_tensordict.get(keys.TRAFFIC, None), number)
         return next_tensordict.set(keys.IMAGE, image)
+
+    def _episodes_numbers(self, tensordict: TensorDictBase) -> Tensor:
+        """The numbers drawn at the resets, written into the data."""
+        if len(self._numbers) != tensordict.numel():
+            raise ValueError(
+                "appearance='episode' needs the env's reset or ('world', 'appearance') in the data; use 'sample'"
+            )
+        tensordict[keys.APPEARANCE] = self._numbers.view(*tensordict.batch_size, 1)
+        return tensordict[keys.APPEARANCE]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Draw the images of a batch from a replay buffer."""

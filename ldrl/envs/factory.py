@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -21,7 +22,7 @@ __all__ = ["make_env", "make_highway_env"]
 
 
 def make_env(
-    town: str | Town,
+    town: str | Path | Town,
     num_cars: int | None = None,
     *,
     episodes: Sequence[Episode] | None = None,
@@ -36,7 +37,7 @@ def make_env(
     """A town with labels, instructions and a dash camera, ready for an agent.
 
     Args:
-        town: a town or the name of one.
+        town: a town, the name of one or the path of an OpenDRIVE map.
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: one per row, with their instructions; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
@@ -51,13 +52,13 @@ def make_env(
         >>> sorted(make_env("town1", num_cars=2).reset().keys())
         ['done', 'end_of_subtask', 'instruction_tokens', 'observation', 'subtask', 'terminated', 'truncated', 'world']
     """
-    town = Town.load(town) if isinstance(town, str) else town
+    town = town if isinstance(town, Town) else Town.load(town)
     env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, traffic=traffic, device=device, seed=seed)
     return _stack(env, town, episodes, policy, modality, appearance, seed)
 
 
 def make_highway_env(
-    town: str | Town,
+    town: str | Path | Town,
     *,
     episode: Episode | None = None,
     policy: TensorDictModuleBase | None = None,
@@ -69,20 +70,20 @@ def make_highway_env(
     """The same on highway-env: one car, batch size ``[]``.
 
     Args:
-        town: a town or the name of one.
+        town: a town, the name of one or the path of an OpenDRIVE map.
         episode: with its instruction; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         modality: of the images, ``"gs"`` or ``"rgb"``.
         appearance: of rgb images, see :class:`~ldrl.envs.DashCamera`.
         config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
-        seed: of the env and of the instructions.
+        seed: of the env, the instructions and the appearances.
 
     Examples:
         >>> make_highway_env("town1", config={"vehicles_count": 3}).reset()["world", "traffic"].shape
         torch.Size([3, 4])
     """
-    town = Town.load(town) if isinstance(town, str) else town
-    env = GymWrapper(HighwayTownEnv({"town": town, "episode": episode} | (config or {})))
+    town = town if isinstance(town, Town) else Town.load(town)
+    env = GymWrapper(HighwayTownEnv((config or {}) | {"town": town, "episode": episode}))
     env.set_seed(seed)
     return _stack(env, town, None if episode is None else [episode], policy, modality, appearance, seed)
 

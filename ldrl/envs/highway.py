@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class HighwayTownEnv(AbstractEnv):
     viewer: EnvViewer | None
 
     def __init__(self, config: dict | None = None, render_mode: str | None = None, *, town: str | None = None) -> None:
-        self._loaded: str | Town | None = None
+        self._loaded: str | Path | Town | None = None
         if town is not None:
             config = {"town": town} | (config or {})
         super().__init__(config, render_mode)
@@ -118,7 +119,7 @@ class HighwayTownEnv(AbstractEnv):
         check(self.config)
         wanted = self.config["town"]
         if wanted != self._loaded:
-            self.town = Town.load(wanted) if isinstance(wanted, str) else wanted
+            self.town = wanted if isinstance(wanted, Town) else Town.load(wanted)
             self.network = IndexedNetwork(self.town.network.graph)
             mark_crossings(self.network)
             self._loaded = wanted
@@ -197,7 +198,7 @@ def keep(before: Space | None, after: Space) -> Space:
 
 def check(config: Mapping[str, Any]) -> None:
     """Raise a ValueError for values that would fail later or be misunderstood."""
-    if not isinstance(config["town"], str | Town):
+    if not isinstance(config["town"], str | Path | Town):
         raise ValueError(f"town is {config['town']!r}; give a Town or the name of one")
     if not isinstance(config["episode"], Episode | Mapping | None):
         raise ValueError(f"episode is {config['episode']!r}; give an Episode, a dictionary of its fields, or None")

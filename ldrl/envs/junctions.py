@@ -79,31 +79,33 @@ class Junctions:
         self.in_junction = town.lane_manoeuvre != SubTask.LANEFOLLOW
         self.exclude = _exclusions(town)
         siblings = town.lane_predecessor.unsqueeze(0) == town.lane_predecessor.unsqueeze(1)
-        self.exclude_any_turn = siblings.float() @ self.exclude.float() > 0
+        self.closers = _lists(self.exclude)
+        self.closers_any_turn = _lists(siblings.float() @ self.exclude.float() > 0)
 
     def committed(self, to_entry: Tensor, speed: Tensor) -> Tensor:
         """Whether cars before a junction can no longer stop, ``[*B]`` bool."""
         return to_entry - vehicle.LENGTH / 2 < speed.square() / (2 * SAFE_BRAKING)
 
-    def closed(self, exclude: Tensor, route: Tensor, position: Tensor, entering: Tensor) -> Tensor:
-        """The lanes that cars close for others.
+    def closed(self, closers: Tensor, asked: Tensor, route: Tensor, position: Tensor, entering: Tensor) -> Tensor:
+        """Whether cars close lanes for others.
 
         Args:
-            exclude: ``[L, L]`` bool, what a car on one lane closes.
-            route: ``[W, N, 6]`` int64, route windows.
-            position: ``[W, N]`` float32, route positions, m.
-            entering: ``[W, N]`` bool, cars that close their next lane, too.
+            closers: ``[L, K]`` int64, the lanes on which a car closes each lane: ``closers`` or ``closers_any_turn``.
+            asked: ``[W, M]`` int64, lanes.
+            route: ``[W, N, 6]`` int64, route windows of the cars.
+            position: ``[W, N]`` float32, their route positions, m.
+            entering: ``[W, N]`` bool, those that close their next lane, too.
 
         Returns:
-            ``[W, L]`` bool.
+            ``[W, M]`` bool.
         """
         lanes = route[..., :3]
         inside = self.in_junction[lanes]
         leaving = inside[..., 0] & (position < CLEAR_DISTANCE)
         used = torch.stack((leaving, inside[..., 1], inside[..., 2] & entering), -1)
-        occupied = torch.zeros(len(route), len(exclude), device=route.device)
+        occupied = torch.zeros(len(route), len(closers) + 1, device=route.device)  # the last lane is none
         occupied.scatter_add_(1, lanes.flatten(1), used.flatten(1).float())
-        return occupied @ exclude.float() > 0
+        return (occupied.gather(1, closers[asked].flatten(1)) > 0).view(*asked.shape, -1).any(-1)
 
     def grant(
         self, may_enter: Tensor, waited: Tensor, route: Tensor, to_entry: Tensor, ahead: Tensor, closed: Tensor
@@ -116,7 +118,7 @@ class Junctions:
             route: ``[W, N, 6]`` int64, route windows.
             to_entry: ``[W, N]`` float32, see :func:`distance_to_entry`.
             ahead: ``[W, N, M]`` float32, how far ahead on each car's route other cars are, m.
-            closed: ``[W, L]`` bool.
+            closed: ``[W, N]`` bool, whether each car's next lane is closed.
 
         Returns:
             ``may_enter`` and ``waited``, one step later.
@@ -131,7 +133,14 @@ class Junctions:
         turn = waited * route.shape[1] - torch.arange(route.shape[1], device=route.device)
         rival = self.exclude[lane.unsqueeze(-1), lane.unsqueeze(-2)] & asks.unsqueeze(-2)
         beaten = (rival & (turn.unsqueeze(-2) > turn.unsqueeze(-1))).any(-1)
-        return may_enter | (asks & ~beaten & ~closed.gather(1, lane)), waited
+        return may_enter | (asks & ~beaten & ~closed), waited
+
+
+def _lists(exclude: Tensor) -> Tensor:
+    """For each lane those that exclude it, ``[L, K]`` int64, filled up with ``L``."""
+    width = max(1, int(exclude.sum(0).max()))
+    lanes = torch.arange(len(exclude), device=exclude.device).unsqueeze(1).where(exclude, len(exclude))
+    return lanes.sort(0).values[:width].t().contiguous()
 
 
 def _exclusions(town: Town) -> Tensor:

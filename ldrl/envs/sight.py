@@ -44,7 +44,7 @@ COARSER = (14.0, 28.0)
 CAR_HEIGHT = 1.5
 """m; less than the camera's."""
 CARS_IN_SIGHT = 8
-"""Other cars drawn at most: the nearest ahead."""
+"""Other cars drawn at most: the nearest in the field of view."""
 STEMS_IN_SIGHT = 8
 """Trees and posts whose stems are drawn: the nearest ahead."""
 LAYERS = 3
@@ -243,7 +243,8 @@ class Sight(nn.Module):
     def cars(self, mount: Mount, traffic: Tensor) -> Cars:
         """The nearest of other cars, ``[N, P, 4]``, in each column."""
         ahead, right = mount.ahead_and_right(traffic[..., :2])
-        seen = (ahead > -vehicle.LENGTH) & (right.abs() < ahead + 2 * vehicle.LENGTH)  # not where there is no car: NaN
+        radius = math.hypot(vehicle.LENGTH, vehicle.WIDTH) / 2
+        seen = (ahead > -radius) & (right.abs() < ahead + math.sqrt(2) * radius)  # not where there is no car: NaN
         distance, which = torch.where(seen, ahead, torch.inf).topk(min(CARS_IN_SIGHT, ahead.shape[1]), largest=False)
         heading = traffic[..., 2].gather(1, which)
         cos, sin = heading.cos(), heading.sin()

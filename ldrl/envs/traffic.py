@@ -107,8 +107,9 @@ class Traffic:
 
     def _capacity(self, agent_starts: Tensor) -> int:
         """Places that are free wherever the agent's car starts."""
-        near = torch.cdist(agent_starts, self._places[2]) < SPAWN_DISTANCE + 0.5  # the starts are samples
-        return len(self._places[0]) - int(near.sum(-1).amax())
+        reach = SPAWN_DISTANCE + 0.5  # the starts are samples
+        near = [int((torch.cdist(some, self._places[2]) < reach).sum(-1).amax()) for some in agent_starts.split(1024)]
+        return len(self._places[0]) - max(near)
 
     @property
     def state(self) -> Tensor:
@@ -175,9 +176,10 @@ class Traffic:
         """
         to_entry = distance_to_entry(self.town, self._route, self._position)
         entering = self._may_enter & self._junctions.committed(to_entry, self._speed)
-        closed = self._junctions.closed(self._junctions.exclude, self._route, self._position, entering)
-        free = ~closed.gather(1, route[:, 2:3]).squeeze(-1)
-        return free | distance_to_entry(self.town, route, position).isinf()
+        closed = self._junctions.closed(
+            self._junctions.closers, route[:, 2:3], self._route, self._position, entering
+        ).squeeze(-1)
+        return ~closed | distance_to_entry(self.town, route, position).isinf()
 
     def any_ahead(self, pose: Tensor, distance: float) -> Tensor:
         """Whether there is a car in front of the agent's, to whichever side.
@@ -203,12 +205,11 @@ class Traffic:
         before = (self._route[..., 1] == agent.route[:, 1:2]) & (self._position > agent.position.unsqueeze(-1))
         drives = (agent.speed >= MOVING_SPEED) & (entry < CLAIM_DISTANCE) & ~before.any(-1)
         entering = drives | (entry < vehicle.LENGTH / 2)
-        by_agent = junctions.closed(
-            junctions.exclude_any_turn, agent.route.unsqueeze(1), agent.position.unsqueeze(1), entering.unsqueeze(1)
-        )
-        stays_out = by_agent.gather(1, self._route[..., 2]) & ~junctions.committed(to_entry, self._speed)
+        asked, at_agent = self._route[..., 2], (agent.route.unsqueeze(1), agent.position.unsqueeze(1))
+        by_agent = junctions.closed(junctions.closers_any_turn, asked, *at_agent, entering.unsqueeze(1))
+        stays_out = by_agent & ~junctions.committed(to_entry, self._speed)
         may_enter = self._may_enter & to_entry.isfinite() & ~stays_out
-        closed = junctions.closed(junctions.exclude, self._route, self._position, may_enter) | by_agent
+        closed = junctions.closed(junctions.closers, asked, self._route, self._position, may_enter) | by_agent
         return junctions.grant(may_enter, self._waited, self._route, to_entry, ahead, closed)
 
     def _accelerate(self, agent: Agent, ahead: Tensor, agent_ahead: Tensor, line: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,7 +15,7 @@ from ldrl.towns.surface import CELL, LANE_SPACING, rasterise, sample
 if TYPE_CHECKING:
     from ldrl.towns.town import Town
 
-__all__ = ["NEARBY", "PROP_CELL", "STOREY", "STYLES", "Scenery"]
+__all__ = ["NEARBY", "PROP_CELL", "REACH", "STOREY", "STYLES", "Scenery"]
 
 REACH = 15.0
 """How far from the road there is scenery, m."""
@@ -37,14 +36,13 @@ NEARBY = 24
 
 
 class Scenery(nn.Module):
-    """A town's surroundings as tensors, the same for the same town and seed.
+    """A town's surroundings as tensors, the same for the same town and its seed.
 
     Along each lane the land behind the sidewalk is cut into lots: houses with the front at the sidewalk or behind a
     garden, of two to six storeys, or greens with trees. Behind them stands a hedge.
 
     Args:
         town: the town.
-        seed: of all that is drawn; None takes it from the town's name.
 
     Attributes:
         pyramid: ``[T]`` uint8, :class:`~ldrl.towns.ground.Material` plus shade of the ground's texels: of those of
@@ -64,9 +62,9 @@ class Scenery(nn.Module):
     props: Tensor
     nearby: Tensor
 
-    def __init__(self, town: Town, seed: int | None = None) -> None:
+    def __init__(self, town: Town) -> None:
         super().__init__()
-        self.seed = zlib.crc32(town.name.encode()) if seed is None else seed
+        self.seed = town.seed
         surface = rasterise(town.points.cpu(), town.headings.cpu(), town.half_width.cpu(), LANE_SPACING, REACH)
         beyond = surface.road_distance[0, 0]
         lots = _Lots(town, self.seed, surface.origin, surface.nearest_point, beyond)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from torch.nn.functional import embedding
 from ldrl.subtasks import SubTask
 from ldrl.towns import opendrive, surface
 from ldrl.towns.layout import LAYOUTS, load_layout
-from ldrl.towns.scenery import Scenery
+from ldrl.towns.scenery import REACH, Scenery
 from ldrl.towns.surface import LANE_SPACING
 
 __all__ = ["ROUTE_LANES", "Town"]
@@ -40,6 +41,7 @@ class Town(nn.Module):
         network: a highway-env network whose lanes carry a ``manoeuvre`` (:class:`~ldrl.subtasks.SubTask`). Those of
             junctions may carry ``options``, the manoeuvres that the road offers which they come from; without, these
             are the ones that the lane before offers.
+        seed: of the scenery; None takes it from the name, without folders.
 
     Attributes:
         lane_length: ``[L]`` float32, m.
@@ -82,9 +84,10 @@ class Town(nn.Module):
     shoulder = SHOULDER
     _scenery: Scenery | None
 
-    def __init__(self, name: str, network: RoadNetwork) -> None:
+    def __init__(self, name: str, network: RoadNetwork, seed: int | None = None) -> None:
         super().__init__()
         self.name = name
+        self.seed = zlib.crc32(Path(name).name.encode()) if seed is None else seed
         self.register_module("_scenery", None)
         self.network = network
         self.lane_indices = [
@@ -174,6 +177,8 @@ class Town(nn.Module):
 
     def _register_surface(self) -> None:
         try:
+            reach = 2 * (REACH + float(self.half_width.max()))  # the scenery's rasters are larger
+            surface.raster_size((self.points.amax(0) - self.points.amin(0) + reach).tolist())
             rasters = surface.rasterise(self.points, self.headings, self.half_width, LANE_SPACING)
         except ValueError as error:
             raise ValueError(f"town {self.name!r}: {error}") from None

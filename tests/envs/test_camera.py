@@ -308,7 +308,9 @@ def test_appearance_of_a_sample(town2):
     [
         ({"modality": "depth"}, "modality 'depth' is unknown; use one of gs, rgb"),
         ({"modality": "rgb", "appearance": "snow"}, "'snow' is unknown; use one of clear, overcast"),
-        ({"modality": "rgb", "appearance": -1}, "appearance -1 is negative"),
+        ({"modality": "rgb", "appearance": -1}, "appearance is -1; use a number from 0"),
+        ({"modality": "rgb", "appearance": True}, "appearance is True"),
+        ({"modality": "rgb", "appearance": 1 << 60}, "use a number from 0 to 2"),
     ],
 )
 def test_bad_arguments(town1, arguments, message):

@@ -114,7 +114,9 @@ def test_depends_on_town_and_seed_only(square):
     def tensors(scenery):
         return dict(scenery.named_buffers())
 
-    again, other = Scenery(square), Scenery(square, seed=1)
+    again, other = Scenery(square), Town("square", square.network, seed=1).scenery
+    elsewhere = Town("maps/square", square.network).scenery
+    assert torch.equal(elsewhere.pyramid, again.pyramid)
     assert all(torch.equal(value, tensors(again)[name]) for name, value in tensors(square.scenery).items())
     assert not torch.equal(other.ground(), again.ground())
     road = again.ground() <= Material.STOP_LINE
