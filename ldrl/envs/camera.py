@@ -23,7 +23,7 @@ Modality = Literal["gs", "rgb"]
 MOST_APPEARANCES = 1 << 60
 CHANNELS = {"gs": 1, "rgb": 3}
 """Channels of the image in each modality."""
-FRAMES_AT_ONCE = {"cpu": 32, "cuda": 2048}
+FRAMES_AT_ONCE = {"cpu": 128, "cuda": 2048}
 """Frames drawn together: on a processor so few that their rays stay in its cache, on a GPU as many as keep it busy."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
@@ -75,7 +76,8 @@ class Scenery(nn.Module):
         levels = [ground.materials(lots.green, lots.walls[0, 0])]
         levels += [levels[0][step // 2 :: step, step // 2 :: step] for step in (2, 4)]
         self.sizes = [level.shape for level in levels]
-        self._buffer("pyramid", torch.cat([level.flatten() for level in levels]))
+        # NumPy asks the system for huge pages, torch does not: without them cameras in large towns miss the page table.
+        self._buffer("pyramid", torch.from_numpy(np.concatenate([level.flatten().numpy() for level in levels])))
         self._buffer("walls", lots.walls)
         self._buffer("facade", lots.facade)
         self._buffer("props", props)
