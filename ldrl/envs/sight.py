@@ -141,8 +141,8 @@ class Sight(nn.Module):
         row: ``[44, 1]`` int16, numbers of rows, counted from the horizon up or down.
         reach: ``[44]``, how far ahead the rows below the horizon meet the ground, m.
         depths: ``[D + 1]``, those of the rows, more depths between them, and infinity, ascending, m.
-        far_depths: ``[20]``, where higher buildings are looked for behind lower ones, m.
-        far_rays: ``[2, 20 * 200]``, points at these depths along each column, ahead and to the right, m.
+        far_depths: ``[24]``, where higher buildings are looked for behind lower ones, m.
+        far_rays: ``[2, 24 * 200]``, points at these depths along each column, ahead and to the right, m.
     """
 
     slope: Tensor
@@ -173,7 +173,7 @@ class Sight(nn.Module):
         self._buffer("depths", nn.functional.pad(ascending, (0, 1), value=math.inf))
         self._buffer("row", torch.arange(HORIZON, dtype=torch.int16).unsqueeze(-1))
         self._buffer("rows_beyond", (reach >= self.depths.unsqueeze(-1)).sum(-1).to(torch.int16))
-        self._buffer("far_depths", 10 * (FARTHEST / 10) ** torch.linspace(0, 1, 20))
+        self._buffer("far_depths", 4 * (FARTHEST / 4) ** torch.linspace(0, 1, 24))
         self._buffer("rank", (len(order) - order.argsort()).to(torch.uint8).unsqueeze(-1))
         self._buffer("rays", _fan(torch.cat((between, reach)), slope))
         self._buffer("far_rays", _fan(self.far_depths, slope))

@@ -34,6 +34,16 @@ def test_materials_are_told_apart():
     assert near.flatten(1).unique(dim=0).shape[0] == 60
 
 
+def test_rain_darkens_the_road_and_the_sun_one_side_of_a_house():
+    numbers = torch.tensor([appearance_number(10, weather) for weather in ("overcast", "rain")])
+    overcast, rain = channels(looks(numbers))[:, 0].float()
+    share = rain / overcast.clamp(min=1)
+    assert (share[Material.ASPHALT] < 0.85 * share[Material.SIDEWALK]).all()
+    walls = channels(looks(torch.tensor([60])))[0, 0, Code.FACADE : Code.SKY].float().view(-1, 3, 3, 3)
+    assert (walls[:, 0] < walls[:, 1]).all()
+    assert (walls[:, 1] < walls[:, 2]).all()
+
+
 def test_haze_grows_with_depth_towards_the_horizon():
     look = channels(looks(torch.tensor([WEATHERS.index("fog")])))[0].float()
     horizon = look[0, Code.SKY]

@@ -303,6 +303,25 @@ def test_appearance_of_a_sample(town2):
     assert torch.equal(images, DashCamera(town2, modality="rgb", appearance="sample", seed=1).draw(poses))
 
 
+def test_appearance_in_a_replay_buffer(town2):
+    """What the camera was made with counts; only one that draws per episode reads what was stored."""
+    poses = poses_of(town2, 6)
+    data = TensorDict({keys.POSE: poses, keys.APPEARANCE: torch.arange(6).unsqueeze(-1) * 100}, [6])
+
+    def seen(appearance, data=data):
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=6)
+        buffer.append_transform(DashCamera(town2, modality="rgb", appearance=appearance))
+        buffer.extend(data)
+        return [buffer[:][keys.IMAGE] for _ in range(2)]
+
+    camera = DashCamera(town2, modality="rgb")
+    assert torch.equal(seen("episode")[0], camera.draw(poses, None, data[keys.APPEARANCE]))
+    assert torch.equal(seen("night")[0], DashCamera(town2, modality="rgb", appearance="night").draw(poses))
+    assert not torch.equal(*seen("sample"))
+    with pytest.raises(ValueError, match="needs the env's reset or"):
+        seen("episode", data.select(keys.POSE))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

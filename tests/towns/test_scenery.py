@@ -1,8 +1,14 @@
 """The ground against geometry, what stands on it, and that it depends on the town and the seed only."""
 
+import math
+from itertools import pairwise
+
 import pytest
 import torch
+from highway_env.road.lane import CircularLane
+from highway_env.road.road import RoadNetwork
 
+from ldrl.subtasks import SubTask
 from ldrl.towns import Layout, Town
 from ldrl.towns.ground import SIDEWALK, TEXELS, Material
 from ldrl.towns.layout import Node
@@ -58,6 +64,28 @@ def test_the_centre_line_is_dashed(square):
     assert gap == pytest.approx(0.47, abs=0.06)
     changes = (line == Material.CENTRE_GAP).int().diff().abs().sum()
     assert changes >= 15
+
+
+def test_lanes_side_by_side_are_divided_by_dashes():
+    network = RoadNetwork()
+    quarters = [k * math.pi / 2 for k in range(5)]
+    for k, (start, end) in enumerate(pairwise(quarters)):
+        for radius in (34.0, 30.0):
+            lane = CircularLane((0, 0), radius, start, end, clockwise=True, width=4.0)
+            lane.manoeuvre = SubTask.LANEFOLLOW
+            network.add_lane(str(k), str((k + 1) % 4), lane)
+    scenery = Town("ring", network).scenery
+    angle = torch.arange(0, 2 * math.pi, 0.002)
+    line = ground_at(scenery, 32 * angle.cos(), 32 * angle.sin())
+    assert (line == Material.LANE_LINE).float().mean() == pytest.approx(0.4, abs=0.12)
+    edge = ground_at(scenery, 36 * angle.cos(), 36 * angle.sin())
+    assert (edge == Material.EDGE_LINE).float().mean() > 0.5
+
+
+def test_some_of_the_road_is_patched(town):
+    ground = town.scenery.ground()
+    road, patch = ground <= Material.STOP_LINE, (ground >= Material.PATCH) & (ground < Material.EDGE_LINE)
+    assert 0.01 < patch.sum() / road.sum() < 0.1
 
 
 def test_stop_lines_and_no_lines_in_junctions(town2):
