@@ -141,6 +141,10 @@ class Sight(nn.Module):
         row: ``[44, 1]`` int16, numbers of rows, counted from the horizon up or down.
         reach: ``[44]``, how far ahead the rows below the horizon meet the ground, m.
         depths: ``[D + 1]``, those of the rows, more depths between them, and infinity, ascending, m.
+        rays: ``[2, D * 200]``, points along each column at the depths between rows, then at the rows', m.
+        levels: how many of these depths read the coarsest ground, it or the next, and any.
+        rows_beyond: ``[D + 1]`` int16, rows that lie beyond each of ``depths``.
+        rank: ``[D, 1]`` uint8, of the depths of ``rays``, the nearest highest.
         far_depths: ``[24]``, where higher buildings are looked for behind lower ones, m.
         far_rays: ``[2, 24 * 200]``, points at these depths along each column, ahead and to the right, m.
     """

@@ -15,6 +15,7 @@ from torch.nn.functional import embedding
 
 from ldrl.subtasks import SubTask
 from ldrl.towns import opendrive, surface
+from ldrl.towns.ground import stations
 from ldrl.towns.layout import LAYOUTS, load_layout
 from ldrl.towns.scenery import REACH, Scenery
 from ldrl.towns.surface import LANE_SPACING
@@ -182,7 +183,7 @@ class Town(nn.Module):
             rasters = surface.rasterise(self.points, self.headings, self.half_width, LANE_SPACING)
         except ValueError as error:
             raise ValueError(f"town {self.name!r}: {error}") from None
-        lane_of_point = torch.searchsorted(self.lane_first, torch.arange(len(self.points)), right=True) - 1
+        lane_of_point, _ = stations(self)
         on_street = self.lane_manoeuvre[lane_of_point[rasters.nearest_point]] == SubTask.LANEFOLLOW
         on_street &= rasters.road_distance[0, 0] < 0
         heading = self.headings[rasters.nearest_point]
