@@ -3,7 +3,8 @@
 import pytest
 
 from ldrl.envs import builtin_episodes
-from ldrl.towns import Town
+from ldrl.towns import Layout, Town
+from ldrl.towns.layout import Node
 
 
 @pytest.fixture(scope="session")
@@ -29,3 +30,10 @@ def town(request, towns):
 @pytest.fixture(scope="session")
 def episodes(towns):
     return {name: builtin_episodes(town) for name, town in towns.items()}
+
+
+@pytest.fixture(scope="session")
+def square():
+    """Streets 100 m long, centre lines on x, y = 0 and 100, 8 m wide and 0.3 m of shoulder on either side."""
+    nodes = {"a": Node(0, 0, 8), "b": Node(100, 0, 8), "c": Node(100, 100, 8), "d": Node(0, 100, 8)}
+    return Town("square", Layout("square", 4.0, nodes, (("a", "b", "c", "d", "a"),)).network())

@@ -16,20 +16,11 @@ from ldrl.envs.appearance import CODES, WEATHERS
 from ldrl.envs.camera import shift
 from ldrl.envs.sight import COARSER, Mount
 from ldrl.subtasks import MANOEUVRES
-from ldrl.towns import Layout, Town
 from ldrl.towns.ground import TEXELS, Material
-from ldrl.towns.layout import Node
 from ldrl.towns.surface import CELL, sample
 
 TEXEL = CELL / TEXELS
 FORWARD, ABOVE, FOCAL = 1.6, 1.7, 100.0
-
-
-@pytest.fixture(scope="module")
-def square():
-    """Streets 100 m long, centre lines on x, y = 0 and 100, 8 m wide and 0.3 m of shoulder on either side."""
-    nodes = {"a": Node(0, 0, 8), "b": Node(100, 0, 8), "c": Node(100, 100, 8), "d": Node(0, 100, 8)}
-    return Town("square", Layout("square", 4.0, nodes, (("a", "b", "c", "d", "a"),)).network())
 
 
 def poses_of(town, count, seed=0):

@@ -9,21 +9,13 @@ from highway_env.road.lane import CircularLane
 from highway_env.road.road import RoadNetwork
 
 from ldrl.subtasks import SubTask
-from ldrl.towns import Layout, Town
+from ldrl.towns import Town
 from ldrl.towns.ground import SIDEWALK, TEXELS, Material
-from ldrl.towns.layout import Node
 from ldrl.towns.noise import hash_uniform
 from ldrl.towns.scenery import NEARBY, PROP_CELL, STYLES, Scenery
 from ldrl.towns.surface import CELL, sample
 
 TEXEL = CELL / TEXELS
-
-
-@pytest.fixture(scope="module")
-def square():
-    """Streets 100 m long, centre lines on x, y = 0 and 100, 8 m wide and 0.3 m of shoulder on either side."""
-    nodes = {"a": Node(0, 0, 8), "b": Node(100, 0, 8), "c": Node(100, 100, 8), "d": Node(0, 100, 8)}
-    return Town("square", Layout("square", 4.0, nodes, (("a", "b", "c", "d", "a"),)).network())
 
 
 def ground_at(scenery, x, y):
