@@ -76,11 +76,12 @@ def fit(
 
 def view(cfg: DictConfig, storage: Storage, sampler: Sampler, batch_size: int, disturbed: DisturbedView, town: Town):
     """A buffer over the demonstrations that draws their images, seen from disturbed poses, when sampled."""
+    camera = DashCamera(town, modality=cfg.modality, appearance=cfg.appearance, seed=cfg.seed)
     return TensorDictReplayBuffer(
         storage=storage,
         sampler=sampler,
         batch_size=batch_size,
-        transform=Compose(disturbed, DeviceCastTransform(cfg.device), DashCamera(town).to(cfg.device)),
+        transform=Compose(disturbed, DeviceCastTransform(cfg.device), camera.to(cfg.device)),
     )
 
 
@@ -132,7 +133,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     try:
         towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
-        agent = HierarchicalAgent(AgentConfig(**OmegaConf.to_container(cfg.model))).to(cfg.device)
+        agent = HierarchicalAgent(AgentConfig(modality=cfg.modality, **OmegaConf.to_container(cfg.model))).to(cfg.device)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device

@@ -74,16 +74,19 @@ def evaluate(
     towns: dict[str, Town],
     *,
     num_cars: int = 64,
+    appearance: str | int = "clear",
     device: torch.device | str = "cpu",
     progress: Callable[[int], object] | None = None,
 ) -> list[Outcome]:
     """Drive each episode once.
 
     Args:
-        policy: the agent, or what makes a policy for a town, such as :class:`~ldrl.collectors.Expert`.
+        policy: the agent, which sees its ``modality`` (``"gs"`` for a policy without one), or what makes a policy for
+            a town, such as :class:`~ldrl.collectors.Expert`.
         episodes: of any towns.
         towns: by name, all that the episodes name.
         num_cars: episodes driven side by side.
+        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
         device: where to drive.
         progress: called with the number of episodes done after each batch of them.
 
@@ -104,7 +107,14 @@ def evaluate(
         actor = policy if isinstance(policy, TensorDictModuleBase) else policy(town)
         for start in range(0, len(rows), num_cars):
             batch = rows[start : start + num_cars]
-            env = make_env(town, episodes=[episodes[i] for i in batch], policy=actor, device=device)
+            env = make_env(
+                town,
+                episodes=[episodes[i] for i in batch],
+                policy=actor,
+                modality=getattr(actor, "modality", "gs"),
+                appearance=appearance,
+                device=device,
+            )
             for i, outcome in zip(batch, _drive(env, actor, [episodes[i] for i in batch]), strict=True):
                 outcomes[i] = outcome
             if progress is not None:

@@ -20,13 +20,16 @@ from ldrl.subtasks import SubTask
 
 __all__ = ["AgentConfig", "HierarchicalAgent"]
 
+CHANNELS = {"gs": 1, "ps": 1, "rgb": 3}
+"""Channels of the image by modality."""
+
 
 @dataclass(frozen=True)
 class AgentConfig:
     """Sizes of the agent; the defaults are small enough for two CPU cores, :meth:`paper` gives the paper's.
 
     Args:
-        image_channels: 1 for road segmentation.
+        modality: what the agent sees: ``"gs"``, ``"ps"`` (one channel) or ``"rgb"``.
         image_rows: how many rows of the image the encoders see, from the bottom up.
         conv_channels: of each image encoder's convolutions.
         features: size of each linear layer behind an image encoder.
@@ -36,10 +39,10 @@ class AgentConfig:
         high_level_hidden: size of the high-level GRU.
 
     Raises:
-        ValueError: a size is no whole number above 0.
+        ValueError: a size is no whole number above 0, or the modality is unknown.
     """
 
-    image_channels: int = 1
+    modality: str = "gs"
     image_rows: int = 48
     conv_channels: tuple[int, int, int] = (16, 32, 64)
     features: int = 128
@@ -49,7 +52,9 @@ class AgentConfig:
     high_level_hidden: int = 128
 
     def __post_init__(self) -> None:
-        sizes = {name: value for name, value in vars(self).items() if name != "conv_channels"}
+        if self.modality not in CHANNELS:
+            raise ValueError(f"modality is {self.modality!r}; use one of {', '.join(CHANNELS)}")
+        sizes = {name: value for name, value in vars(self).items() if name not in ("modality", "conv_channels")}
         if len(self.conv_channels) != 3:
             raise ValueError(f"conv_channels is {self.conv_channels!r}; give three sizes, one for each convolution")
         for name, value in (*sizes.items(), *(("conv_channels", value) for value in self.conv_channels)):
@@ -94,8 +99,9 @@ class HierarchicalAgent(TensorDictModuleBase):
         self.config = config = AgentConfig() if config is None else config
 
         def encoder() -> ImageEncoder:
-            return ImageEncoder(config.image_channels, config.conv_channels, config.image_rows)
+            return ImageEncoder(CHANNELS[config.modality], config.conv_channels, config.image_rows)
 
+        self.modality = config.modality
         self.high_level = HighLevelPolicy(
             encoder=encoder(),
             channels=config.conv_channels[-1],
