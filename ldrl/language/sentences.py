@@ -67,6 +67,12 @@ class Sentences:
         group = rng.choice(self._groups[Keyword.parse(keyword).name])
         return _join(rng.choice(parts) for parts in group)
 
+    def parts(self, keyword: str | Keyword) -> Iterator[str]:
+        """Iterates over the parts that the keyword's sentences are made of, some of them more than once."""
+        for group in self._groups[Keyword.parse(keyword).name]:
+            for slot in group:
+                yield from slot
+
     def count(self, keyword: str | Keyword) -> int:
         """Returns how many distinct sentences the keyword has."""
         return sum(math.prod(map(len, group)) for group in self._groups[Keyword.parse(keyword).name])

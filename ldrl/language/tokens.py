@@ -6,10 +6,14 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 
 import torch
+from rapidfuzz import process
+from rapidfuzz.distance import OSA
 
 from ldrl.language.glove import SPECIAL_ROWS, Glove, load_glove
+from ldrl.language.passenger import training_words
 
 __all__ = ["MAX_TOKENS", "PADDING", "UNKNOWN", "Tokenizer", "normalise"]
 
@@ -19,6 +23,11 @@ PADDING = 0
 """Token id after the end of a sentence."""
 UNKNOWN = 1
 """Token id of every word that GloVe does not have."""
+
+RARE = 30_000
+"""Words beyond this rank in GloVe are read as a word of a command that they resemble: "frst", "rihgt"."""
+EDITS = {4: 1, 5: 1}
+"""How many letters may differ by the word's length: none in shorter words, two in longer ones."""
 
 _WORD_OR_SYMBOL = re.compile(r"[^\W_]+|[^\w\s]")
 
@@ -50,12 +59,26 @@ def _is_symbol(character: str) -> bool:
     return not character.isascii() and unicodedata.category(character) in ("So", "Sm", "Sc")
 
 
+@cache
+def _read_as(word: str) -> tuple[str, ...]:
+    """The words of commands that a misspelt or run-together word stands for; none where it resembles nothing."""
+    known = training_words()
+    if len(word) >= min(EDITS):
+        near = process.extractOne(word, known, scorer=OSA.distance, score_cutoff=EDITS.get(len(word), 2))
+        if near is not None:
+            return (near[0],)
+    cuts = ((word[:k], word[k:]) for k in range(1, len(word)))
+    return next((parts for parts in cuts if set(parts) <= set(known)), ())
+
+
 class Tokenizer:
     """Writes sentences as rows of token ids.
 
-    Id 0 is padding, 1 an unknown word, and ``r + 2`` the word of row ``r`` in GloVe. A sentence longer than
-    ``max_tokens`` keeps its first words; the longest template sentence fits. Unknown words that were kept are
-    counted in ``unknown``, so that a run can say what its passengers said in vain.
+    Id 0 is padding, 1 an unknown word, and ``r + 2`` the word of row ``r`` in GloVe. A word that GloVe does not have
+    or that is rare, and that differs by a letter or two from a word of the training sentences, is read as that one;
+    two such words run together are taken apart. A sentence longer than ``max_tokens`` keeps its first words; the
+    longest template sentence fits. Words that remain unknown are counted in ``unknown``, so that a run can say what
+    its passengers said in vain.
 
     Args:
         max_tokens: length of a row.
@@ -66,10 +89,10 @@ class Tokenizer:
 
     Examples:
         >>> tokenizer = Tokenizer(max_tokens=4)
-        >>> tokenizer(["Turn left!", "turn lefft"]).tolist()
-        [[892, 220, 0, 0], [892, 1, 0, 0]]
+        >>> tokenizer(["Turn left!", "trun lefft", "turn zzyzzyx"]).tolist()
+        [[892, 220, 0, 0], [892, 220, 0, 0], [892, 1, 0, 0]]
         >>> tokenizer.unknown
-        Counter({'lefft': 1})
+        Counter({'zzyzzyx': 1})
     """
 
     def __init__(self, max_tokens: int = MAX_TOKENS, glove: Glove | None = None) -> None:
@@ -98,10 +121,13 @@ class Tokenizer:
         return torch.tensor(rows, dtype=torch.int64).reshape(-1, self.max_tokens)
 
     def _row(self, sentence: str) -> list[int]:
-        words = normalise(sentence)[: self.max_tokens]
-        if not words:
-            raise ValueError(f"the instruction {sentence!r} has no word: say what to do, for example 'turn left'")
         vocabulary = self.glove.words
+        said = normalise(sentence)
+        if not said:
+            raise ValueError(f"the instruction {sentence!r} has no word: say what to do, for example 'turn left'")
+        rare = [vocabulary.get(word, RARE) >= RARE for word in said]
+        read = [(_read_as(word) or (word,)) if odd else (word,) for word, odd in zip(said, rare, strict=True)]
+        words = [word for part in read for word in part][: self.max_tokens]
         ids = [PADDING] * self.max_tokens
         for position, word in enumerate(words):
             if word in vocabulary:

@@ -1,0 +1,196 @@
+"""How passengers speak: training sentences and looser phrasings, with slips, corrections and talk around them."""
+
+from __future__ import annotations
+
+import random
+import string
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import yaml
+
+from ldrl.language.glove import Glove, load_glove
+from ldrl.language.keywords import KEYWORDS, Keyword
+from ldrl.language.sentences import Sentences
+
+__all__ = ["MEANINGFUL", "Passenger", "training_words"]
+
+MEANINGFUL = frozenset(
+    "left right straight first second next two twice times both another again more double pair couple".split()
+)
+"""Words that say which way and how often; nothing random happens to them."""
+FREQUENT = 20_000
+"""How many of the most frequent words can be put into a sentence at random."""
+LOOSE = 0.4
+"""Share of commands that are put in a looser phrasing than the templates'."""
+CLEAN = 0.2
+"""Share of commands that are said without anything around them."""
+CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.3, 0.1, 0.25, 0.5
+"""Shares of the other commands with a self-correction, fillers, talk around them, a repetition, slips of the tongue,
+the typing hand or the speech recogniser, and words dropped, replaced or inserted at random."""
+RATE = 0.1
+"""Probability that a word is dropped, replaced, or has another before it, in a sentence so disturbed."""
+DIRECTIONS = ("left", "right", "straight")
+ORDINALS = ("first", "second")
+
+
+class Passenger:
+    """Says keywords for training, each time in another way.
+
+    Args:
+        glove: where random words come from; None for the package's.
+        max_words: what a listener hears out; the :class:`~ldrl.language.Tokenizer` keeps so many.
+
+    Examples:
+        >>> Passenger().say("left", random.Random(4))
+        'make the left turn'
+        >>> Passenger().nonsense(random.Random(1))
+        'zzyzzyx coca rimet'
+    """
+
+    def __init__(self, glove: Glove | None = None, max_words: int = 48) -> None:
+        self.max_words = max_words
+        self._sentences = Sentences("train")
+        # GloVe's rows are sorted by frequency: what people say is among the first.
+        frequent = list((load_glove() if glove is None else glove).words)[:FREQUENT]
+        self._words = [word for word in frequent if word.isalpha() and word not in MEANINGFUL]
+
+    def say(self, keyword: str | Keyword, rng: random.Random) -> str:
+        """Say a keyword.
+
+        Args:
+            keyword: what is meant, in any spelling that :meth:`Keyword.parse` knows.
+            rng: the source of randomness; nothing else decides.
+
+        Returns:
+            A sentence of 1 to ``max_words`` words.
+        """
+        keyword = Keyword.parse(keyword)
+        plain = self._phrase(keyword, rng)
+        words = plain.split()
+        if rng.random() < CLEAN:
+            return plain
+        happens = [rng.random() < share for share in (CORRECTED, DISTURBED, REPEATED, FILLED, TALKED, SLIPPED)]
+        for happened, change in zip(
+            happens, (self._correct, self._disturb, self._repeat, self._fill, self._talk, self._slip), strict=True
+        ):
+            if happened:
+                words = change(words, rng)
+        return " ".join(words) if 0 < len(words) <= self.max_words else plain
+
+    def nonsense(self, rng: random.Random) -> str:
+        """Known and unknown words at random, or talk that asks for nothing: 1 to 12 words."""
+        if rng.random() < 0.3:  # noqa: PLR2004
+            return _talk(rng)
+        unknown = rng.random()
+        words = rng.choices(self._words, k=rng.randint(1, 12))
+        return " ".join("zzyzzyx" if rng.random() < unknown else word for word in words)
+
+    def _phrase(self, keyword: Keyword, rng: random.Random) -> str:
+        if rng.random() >= LOOSE:
+            return self._sentences.sample(keyword, rng)
+        body = rng.choice(_phrasings(keyword.name))
+        return rng.choice(_spoken()["frames"]).format(body=body)
+
+    def _disturb(self, words: list[str], rng: random.Random) -> list[str]:
+        """Drop, replace and insert words that do not say which way or how often."""
+        disturbed = []
+        for word in words:
+            if rng.random() < RATE:
+                disturbed.append(rng.choice(self._words))
+            chance = rng.random()
+            if word in MEANINGFUL or chance >= 2 * RATE:
+                disturbed.append(word)
+            elif chance < RATE:
+                disturbed.append(rng.choice(self._words))
+        return disturbed or words
+
+    def _correct(self, words: list[str], rng: random.Random) -> list[str]:
+        """Say something wrong first, and take it back: the last word counts."""
+        marker = rng.choice(_spoken()["corrections"]).split()
+        spots = [k for k, word in enumerate(words) if word in DIRECTIONS or word in ORDINALS]
+        if not spots or rng.random() < 0.3:  # noqa: PLR2004
+            wrong = self._phrase(rng.choice(list(KEYWORDS.values())), rng).split()
+            return wrong[: rng.randint(1, len(wrong))] + marker + words
+        spot = rng.choice(spots)
+        others = DIRECTIONS if words[spot] in DIRECTIONS else ORDINALS
+        wrong_word = rng.choice([word for word in others if word != words[spot]])
+        before = rng.randint(0, min(spot, 3))  # words said again in the second try
+        return [*words[:spot], wrong_word, *marker, *words[spot - before :]]
+
+    def _repeat(self, words: list[str], rng: random.Random) -> list[str]:
+        """Say it again, in the same words."""
+        return words + rng.choice(_spoken()["confirmations"]).split() + words
+
+    def _fill(self, words: list[str], rng: random.Random) -> list[str]:
+        """Fill pauses, or stammer."""
+        for _ in range(rng.randint(1, 3)):
+            spot = rng.randint(0, len(words))
+            stammers = spot < len(words) and words[spot] not in MEANINGFUL and rng.random() < 0.3  # noqa: PLR2004
+            said = [words[spot]] if stammers else rng.choice(_spoken()["fillers"]).split()
+            words = words[:spot] + said + words[spot:]
+        return words
+
+    def _talk(self, words: list[str], rng: random.Random) -> list[str]:
+        """Talk of other things before or after, with direction words in another sense."""
+        for _ in range(rng.randint(1, 2)):
+            said = _talk(rng).split()
+            words = said + words if rng.random() < 0.6 else words + said  # noqa: PLR2004
+        return words
+
+    def _slip(self, words: list[str], rng: random.Random) -> list[str]:
+        """Misspell one or two words, or hear others that sound like them."""
+        words = list(words)
+        crucial = [k for k, word in enumerate(words) if word in MEANINGFUL]
+        spots = rng.sample(range(len(words)), min(len(words), rng.randint(1, 2)))
+        if crucial and rng.random() < 0.6:  # noqa: PLR2004
+            spots.append(rng.choice(crucial))
+        for spot in dict.fromkeys(spots):
+            heard = _spoken()["slips"].get(words[spot])
+            words[spot] = rng.choice(heard) if heard and rng.random() < 0.5 else _misspell(words[spot], rng)  # noqa: PLR2004
+        return words
+
+
+def _misspell(word: str, rng: random.Random) -> str:
+    """One edit: a letter dropped, doubled, replaced, or swapped with its neighbour."""
+    k = rng.randrange(len(word))
+    if len(word) < 3:  # noqa: PLR2004 (nobody could read it)
+        return word
+    return rng.choice(
+        (
+            word[:k] + word[k + 1 :],
+            word[:k] + word[k] + word[k:],
+            word[:k] + rng.choice(string.ascii_lowercase) + word[k + 1 :],
+            word[:k] + word[k + 1 : k + 2] + word[k] + word[k + 2 :],
+        )
+    )
+
+
+def _talk(rng: random.Random) -> str:
+    part = rng.choices(_spoken()["talk"], weights=[len(part["rest"]) for part in _spoken()["talk"]])[0]
+    return f"{rng.choice(part['subject'])} {rng.choice(part['rest'])}".strip()
+
+
+@cache
+def _spoken() -> dict[str, Any]:
+    return yaml.safe_load((resources.files(__package__) / "spoken.yaml").read_text("utf-8"))
+
+
+@cache
+def _phrasings(name: str) -> list[str]:
+    """The looser phrasings of a keyword."""
+    keyword = KEYWORDS[name]
+    words = {"dir": keyword.manoeuvres[0].name.lower(), "then": keyword.manoeuvres[-1].name.lower()}
+    return [
+        body.format(**words) for group in _spoken()["phrasings"] if name in group["keywords"] for body in group["bodies"]
+    ]
+
+
+@cache
+def training_words() -> tuple[str, ...]:
+    """All words of the commands to train on, those that say which way and how often first."""
+    sentences = Sentences("train")
+    words = {word for name in KEYWORDS for part in (*sentences.parts(name), *_phrasings(name)) for word in part.split()}
+    words.update(word for frame in _spoken()["frames"] for word in frame.format(body="").split())
+    return tuple(sorted(words, key=lambda word: (word not in MEANINGFUL, word)))
