@@ -228,6 +228,8 @@ def _what_happened(outcome: Outcome) -> Iterator[str]:
         yield "in an oncoming lane"
     if not outcome.largest_gap <= NEAR:  # so that NaN counts as missed
         yield f"missed the path by {outcome.largest_gap:.1f} m"
+    elif outcome.episode.stop and not outcome.success and not outcome.collision:
+        yield "did not stop at the end of the path"
     if outcome.stuck:
         yield "stuck"
     elif outcome.finish_distance is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ldrl.language.disturb import MEANINGFUL, disturb
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
-from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
+from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
 from ldrl.language.sentences import Sentences, Split
 from ldrl.language.tokens import MAX_TOKENS, PADDING, UNKNOWN, Tokenizer, normalise
 
@@ -14,6 +14,7 @@ __all__ = [
     "MAX_TOKENS",
     "MEANINGFUL",
     "PADDING",
+    "SAFE_KEYWORDS",
     "UNKNOWN",
     "Glove",
     "Keyword",
