@@ -231,14 +231,14 @@ class BoundarySampler(DemonstrationSampler):
         }
         return torch.tensor(frames).flatten(), info
 
-    def _segment(self) -> tuple[str, Segment]:
+    def _segment(self) -> tuple[Keyword, Segment]:
         """A keyword and a drive that answers it."""
         # Without misleading instructions nothing is drawn for them: such trainings stay what they were.
         if self._misleading and self._random.random() < self.misleading:
-            keyword = self._random.choice(list(self._misleading))
-            return keyword, self._random.choice(self._random.choice(self._misleading[keyword]))
-        keyword = self._random.choice(list(KEYWORDS))
-        return keyword, self._random.choice(self._segments[keyword])
+            keyword = self._random.choice(list(SAFE_KEYWORDS.values()))
+            return keyword, self._random.choice(self._random.choice(self._misleading[keyword.name]))
+        keyword = self._random.choice(list(KEYWORDS.values()))
+        return keyword, self._random.choice(self._segments[keyword.name])
 
     def _decisions(self, segment: Segment) -> list[tuple[int, SubTask]]:
         """Frames and right answers of one drive through a segment."""
