@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ldrl import keys
 from ldrl.envs import Episode, make_env
+from ldrl.envs.town import STANDING_SPEED
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
 
@@ -23,8 +24,6 @@ NEAR = 10.0
 """A drive succeeds that passes every point of the path, and its last, this close (paper's evaluation), m."""
 FINISH_NEAR = 15.0
 """Strictly, ``finish`` must be declared this close to the path's last point, m."""
-STANDING_SPEED = 0.1
-"""Below it a car stands, m/s."""
 RECORDED = (keys.POSE, keys.SPEED, keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
 
 
