@@ -116,7 +116,7 @@ def test_there_and_back(tmp_path, towns, misleading):
 
 
 def test_the_expert_is_perfect(town, towns, misleading):
-    """Where it should stop it stands within 1.5 m of the path's end, a footprint's front at the junction."""
+    """Where it should stop, it stands within 1.5 m of the path's end."""
     for outcome in evaluate(Expert, misleading[town.name], towns):
         assert outcome.strict_success, outcome.episode.id
         assert not outcome.stuck
