@@ -69,7 +69,8 @@ ROUTE_POSITION = (WORLD, "route_position")
 PROGRESS = (WORLD, "progress")
 """Distance driven along the route since the reset, ``[*B, 1]`` float32, m."""
 REMAINING = (WORLD, "remaining")
-"""Distance left to the end of the episode's path, infinite when roaming, ``[*B, 1]`` float32, m."""
+"""Distance left to the end of the episode's path, or to where the car must cut the throttle to stand there; infinite
+when roaming, ``[*B, 1]`` float32, m."""
 CROSS_TRACK_ERROR = (WORLD, "cross_track_error")
 """Signed distance from the route's centre line, positive to its right, ``[*B, 1]`` float32, m."""
 OFF_ROAD = (WORLD, "off_road")

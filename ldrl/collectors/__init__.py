@@ -3,7 +3,7 @@
 from ldrl.collectors.demonstrations import SteeringNoise, collect_demonstrations
 from ldrl.collectors.evaluation import Outcome, evaluate
 from ldrl.collectors.expert import Expert, expert_action
-from ldrl.collectors.segments import BoundarySampler, Segment, find_segments
+from ldrl.collectors.segments import BoundarySampler, Segment, find_misleading, find_segments
 from ldrl.collectors.snippets import DisturbedView, Snippets, SnippetSampler, cut_snippets
 
 __all__ = [
@@ -19,5 +19,6 @@ __all__ = [
     "cut_snippets",
     "evaluate",
     "expert_action",
+    "find_misleading",
     "find_segments",
 ]

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ldrl import keys
 from ldrl.envs import Episode, make_env
+from ldrl.envs.town import STANDING_SPEED
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
 
@@ -32,7 +33,8 @@ class Outcome:
 
     Args:
         episode: what was to be done.
-        success: the paper's measure: no collision, and every point of the path within 10 m of the track.
+        success: the paper's measure: no collision, and every point of the path within 10 m of the track; where the car
+            should stop, it must also stand at the end, within 10 m of the path's last point.
         strict_success: success, never off the road or in an oncoming lane, and ``finish`` declared within 15 m of the
             path's end.
         collision: whether the car hit a building.
@@ -155,7 +157,9 @@ def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:
     collision, off_road, wrong_lane = (
         bool(drive[key].any()) for key in (keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
     )
-    success = not collision and float(gap.max()) <= NEAR
+    stands = float(drive[keys.SPEED][-1]) < STANDING_SPEED
+    stopped = stands and float((track[-1] - path[-1]).norm()) <= NEAR
+    success = not collision and float(gap.max()) <= NEAR and (stopped or not episode.stop)
     declared = finish_distance is not None and finish_distance <= FINISH_NEAR
     return Outcome(
         episode=episode,
@@ -165,7 +169,7 @@ def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:
         off_road=off_road,
         wrong_lane=wrong_lane,
         finished=finish_distance is not None,
-        stuck=finish_distance is None and float(drive[keys.SPEED][-1]) < 0.1,
+        stuck=finish_distance is None and stands,
         finish_distance=None if finish_distance is None else round(finish_distance, 2),
         largest_gap=round(float(gap.max()), 2),
         seconds=round((len(track) - 1) / 10, 1),

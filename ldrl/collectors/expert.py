@@ -91,8 +91,8 @@ def _give_way(
 class Expert(TensorDictModuleBase):
     """The expert as a policy; reads ``("world", ...)``, which no trained policy may.
 
-    At the end of an episode's path it declares ``("agent", "finish")`` and rolls to a stop. Where there is traffic it
-    reads that and the right of way, too.
+    At the end of an episode's path, or in time to stand there where it should, it declares ``("agent", "finish")`` and
+    rolls to a stop. Where there is traffic it reads that and the right of way, too.
 
     Args:
         town: the town that the cars drive in.

@@ -17,6 +17,7 @@ from ldrl.language import KEYWORDS
 
 __all__ = [
     "PAPER",
+    "PAPER_MISLEADING",
     "check_writable",
     "keyword_table",
     "replacing",
@@ -33,8 +34,14 @@ PAPER: dict[str, dict[str, float]] = {
 }
 """Success of the paper's full model, Hih: Roh et al. 2019, Table 2, ``gs``; train is Town 1, test is Town 2.
 For double in Town 2 its Table 3 prints 0.960."""
+PAPER_MISLEADING: dict[str, dict[str, float]] = {
+    "town1": {"single": 1.000, "double": 1.000, "all": 1.000},
+    "town2": {"single": 1.000, "double": 0.928, "all": 0.946},
+}
+"""The same for misleading instructions only."""
 NOTES = (
-    f"- success, the paper's measure: no collision, and every point of the path within {NEAR:.0f} m of the track.",
+    f"- success, the paper's measure: no collision, and every point of the path within {NEAR:.0f} m of the track; "
+    "a car that should stop must also stand that near to the path's last point.",
     "- strict success: success, never off the road, never in an oncoming lane outside junctions, and `finish` declared "
     f"within {FINISH_NEAR:.0f} m of the end of the path.",
     "- stuck: episodes in which the car came to a stand without having declared `finish`.",
@@ -154,11 +161,12 @@ def _temporary_beside(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def table(outcomes: Sequence[Outcome], paper: Mapping[str, Mapping[str, float]] = PAPER) -> str:
     """The main table, for a terminal and for the report.
 
     Args:
         outcomes: of any towns.
+        paper: success in the paper, by town and type.
 
     Returns:
         A Markdown table: a row per town and type, then ``all``, with the paper's figure where it has one.
@@ -166,7 +174,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
     rows = [("town", "type", "episodes", "success", "strict success", "stuck", "paper")]
     for town, summary in summarise(outcomes)["towns"].items():
         for name, rates in (summary["types"] | {"all": summary}).items():
-            rows.append((town, name, *_figures(rates), str(rates["stuck"]), _rate(PAPER.get(town, {}).get(name))))
+            rows.append((town, name, *_figures(rates), str(rates["stuck"]), _rate(paper.get(town, {}).get(name))))
     return _markdown_table(rows, left=2)
 
 
@@ -228,6 +236,8 @@ def _what_happened(outcome: Outcome) -> Iterator[str]:
         yield "in an oncoming lane"
     if not outcome.largest_gap <= NEAR:  # so that NaN counts as missed
         yield f"missed the path by {outcome.largest_gap:.1f} m"
+    elif outcome.episode.stop and not outcome.success and not outcome.collision:
+        yield "did not stop at the end of the path"
     if outcome.stuck:
         yield "stuck"
     elif outcome.finish_distance is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,17 @@ from torchrl.data.replay_buffers import Storage
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.snippets import DemonstrationSampler, Snippets, cut_snippets
-from ldrl.language import KEYWORDS, MEANINGFUL, Sentences, Split, Tokenizer, disturb, realised_by
+from ldrl.language import (
+    KEYWORDS,
+    MEANINGFUL,
+    SAFE_KEYWORDS,
+    Keyword,
+    Sentences,
+    Split,
+    Tokenizer,
+    disturb,
+    realised_by,
+)
 from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
@@ -28,6 +39,9 @@ ANYWHERE = 0.25
 """Share of instructions given anywhere on the way to the first manoeuvre."""
 BOUNDARY = (-4, 8)
 """Frames around a boundary in which a decision may fall: a sub-task is voted to have ended a little early or late."""
+STOP_IN_SIGHT = 18
+"""An instruction given at most so many frames before the first manoeuvre, 16 m before its junction, that asks for an
+impossible straight is answered by stopping at once: if the car waits for the manoeuvre it can only stop behind it."""
 FREQUENT = 20_000
 """How many of the most frequent words disturb a sentence or make up nonsense."""
 NONSENSE = 0.03
@@ -39,13 +53,22 @@ class Segment:
     """A stretch of a drive that realises a keyword.
 
     Args:
-        snippets: indices of its snippets: the way to the first manoeuvre first, the one behind the last one last.
+        snippets: indices of its snippets: the way to the first manoeuvre first, the one behind the last one last. Where
+            the right answer is to stop, the last one is the manoeuvre that was driven instead.
+        manoeuvres: the right answer at each junction.
     """
 
     snippets: tuple[int, ...]
+    manoeuvres: tuple[SubTask, ...]
 
 
-def find_segments(town: Town, snippets: Snippets, lane: Tensor, max_junctions: int = 3) -> dict[str, list[Segment]]:
+def find_segments(
+    town: Town,
+    snippets: Snippets,
+    lane: Tensor,
+    max_junctions: int = 3,
+    keywords: Mapping[str, Keyword] = KEYWORDS,
+) -> dict[str, list[Segment]]:
     """Find every segment of drives that realises a keyword.
 
     Args:
@@ -53,11 +76,12 @@ def find_segments(town: Town, snippets: Snippets, lane: Tensor, max_junctions: i
         snippets: of the drives.
         lane: the current lane of each frame, ``[N]`` integer.
         max_junctions: the longest segments cross so many junctions: 1 or 2 in the paper, where ordinals of 3 are rare.
+        keywords: what to look for.
 
     Returns:
         Segments by keyword.
     """
-    found: dict[str, list[Segment]] = {name: [] for name in KEYWORDS}
+    found: dict[str, list[Segment]] = {name: [] for name in keywords}
     subtasks, drives = snippets.subtask.tolist(), snippets.drive_start.tolist()
     offered: list[frozenset[SubTask] | None] = []
     for subtask, start, end in zip(subtasks, snippets.start.tolist(), snippets.end.tolist(), strict=True):
@@ -66,19 +90,48 @@ def find_segments(town: Town, snippets: Snippets, lane: Tensor, max_junctions: i
     for first in range(len(subtasks)):
         if subtasks[first] != SubTask.LANEFOLLOW:
             continue
-        manoeuvres: list[int] = []
+        manoeuvres: list[SubTask] = []
+        options: list[frozenset[SubTask]] = []
         for last in range(first + 1, len(subtasks)):
             if drives[last] != drives[first] or len(manoeuvres) > max_junctions:
                 break
+            answer = tuple(manoeuvres)
             if subtasks[last] != SubTask.LANEFOLLOW:
-                manoeuvres.append(last)
-                if offered[last] is None:
+                offer = offered[last]
+                if offer is None:
                     break
-            elif manoeuvres and len(manoeuvres) <= max_junctions:
-                for keyword in realised_by(
-                    [SubTask(subtasks[k]) for k in manoeuvres], [offered[k] or frozenset() for k in manoeuvres]
-                ):
-                    found[keyword.name].append(Segment(tuple(range(first, last + 1))))
+                answer = (*answer, SubTask.FINISH)  # whatever the car did there, it might have stopped
+                manoeuvres.append(SubTask(subtasks[last]))
+                options.append(offer)
+            if answer and len(answer) <= max_junctions:
+                for keyword in realised_by(answer, options, keywords.values()):
+                    found[keyword.name].append(Segment(tuple(range(first, last + 1)), answer))
+    return found
+
+
+def find_misleading(
+    town: Town, snippets: Snippets, lane: Tensor, max_junctions: int = 3
+) -> dict[str, list[list[Segment]]]:
+    """Find every segment of drives that is the safe answer to a keyword which the map does not allow there.
+
+    Args:
+        town: where the drives are.
+        snippets: of the drives.
+        lane: the current lane of each frame, ``[N]`` integer.
+        max_junctions: the longest segments cross so many junctions.
+
+    Returns:
+        Segments by single or double, and by what of it is impossible: each group has another safe answer.
+    """
+    allowed = find_segments(town, snippets, lane, max_junctions)
+    found: dict[str, list[list[Segment]]] = {}
+    for name, segments in find_segments(town, snippets, lane, max_junctions, SAFE_KEYWORDS).items():
+        groups: dict[tuple[SubTask, ...], list[Segment]] = {}
+        possible = set(allowed[name])
+        for segment in segments:
+            if segment not in possible:
+                groups.setdefault(segment.manoeuvres, []).append(segment)
+        found[name] = list(groups.values())
     return found
 
 
@@ -96,10 +149,12 @@ class BoundarySampler(DemonstrationSampler):
         max_junctions: see :func:`find_segments`.
         split: which sentences are said.
         disturbed: share of them that is disturbed, see :func:`~ldrl.language.disturb`.
+        misleading: share of the instructions that ask for what the map does not allow, singles and doubles; answered
+            safely, see :data:`~ldrl.language.SAFE_KEYWORDS`.
         seed: of the sampler's own generator.
 
     Raises:
-        ValueError: no segment realises a keyword.
+        ValueError: no segment realises a keyword, or misleads one when that is asked for.
     """
 
     def __init__(
@@ -111,19 +166,26 @@ class BoundarySampler(DemonstrationSampler):
         max_junctions: int = 3,
         split: Split = "train",
         disturbed: float = 0.7,
+        misleading: float = 0.0,
         seed: int = 0,
     ) -> None:
         stored = buffer.storage[:]
         self._subtask = torch.as_tensor(stored[keys.SUBTASK])
         self._snippets = cut_snippets(self._subtask, torch.as_tensor(stored[TRAJECTORY]))
-        self._segments = find_segments(town, self._snippets, stored[keys.ROUTE][:, 1].long(), max_junctions)
+        lane = stored[keys.ROUTE][:, 1].long()
+        self._segments = find_segments(town, self._snippets, lane, max_junctions)
         lacking = [name for name, segments in self._segments.items() if not segments]
         if lacking:
             raise ValueError(f"no drive in {len(stored)} frames realises {', '.join(lacking)}; collect more")
+        self._misleading = find_misleading(town, self._snippets, lane, max_junctions) if misleading else {}
+        lacking = [name for name, groups in self._misleading.items() if not groups]
+        if lacking:
+            raise ValueError(f"no drive in {len(stored)} frames is misled by {', '.join(lacking)}; collect more")
         self.decisions = 2 * max_junctions + 1
         self._tokenizer = Tokenizer() if tokenizer is None else tokenizer
         self._sentences = Sentences(split)
         self.disturbed = disturbed
+        self.misleading = misleading
         # GloVe's rows are sorted by frequency: what people say is among the first.
         frequent = list(self._tokenizer.glove.words)[:FREQUENT]
         self._words = [word for word in frequent if word.isalpha() and word not in MEANINGFUL]
@@ -143,8 +205,8 @@ class BoundarySampler(DemonstrationSampler):
             raise ValueError(f"a batch of {batch_size} does not divide into sequences of {self.decisions} decisions")
         frames, targets, previous, sentences = [], [], [], []
         for _ in range(batch_size // self.decisions):
-            keyword = self._random.choice(list(KEYWORDS.values()))
-            sequence = self._decisions(self._random.choice(self._segments[keyword.name]))
+            keyword, segment = self._segment()
+            sequence = self._decisions(segment)
             sentence = self._sentences.sample(keyword, self._random)
             if self._random.random() < self.disturbed:
                 sentence = disturb(sentence, self._words, self._random)
@@ -169,13 +231,23 @@ class BoundarySampler(DemonstrationSampler):
         }
         return torch.tensor(frames).flatten(), info
 
+    def _segment(self) -> tuple[Keyword, Segment]:
+        """A keyword and a drive that answers it."""
+        # Without misleading instructions nothing is drawn for them: such trainings stay what they were.
+        if self._misleading and self._random.random() < self.misleading:
+            keyword = self._random.choice(list(SAFE_KEYWORDS.values()))
+            return keyword, self._random.choice(self._random.choice(self._misleading[keyword.name]))
+        keyword = self._random.choice(list(KEYWORDS.values()))
+        return keyword, self._random.choice(self._segments[keyword.name])
+
     def _decisions(self, segment: Segment) -> list[tuple[int, SubTask]]:
         """Frames and right answers of one drive through a segment."""
         first, manoeuvre = segment.snippets[:2]
         begin, boundary = int(self._snippets.start[first]), int(self._snippets.start[manoeuvre])
         earliest = begin if self._random.random() < ANYWHERE else max(begin, boundary + START[0])
         frame = self._random.randint(earliest, boundary + START[1])
-        snippets = list(segment.snippets) if frame < boundary else list(segment.snippets[1:])
+        begun = boundary - STOP_IN_SIGHT if segment.manoeuvres[0] == SubTask.FINISH else boundary
+        snippets = list(segment.snippets) if frame < begun else list(segment.snippets[1:])
         decisions = [(frame, SubTask(int(self._snippets.subtask[snippets[0]])))]
         for k in snippets[1:]:
             # Never before the decision before, nor behind the drive, however short a snippet is.

@@ -6,6 +6,7 @@ from ldrl.envs.factory import make_env, make_highway_env
 from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
+from ldrl.envs.misleading import misleading_episodes
 from ldrl.envs.town import TownEnv
 
 __all__ = [
@@ -19,5 +20,6 @@ __all__ = [
     "load_episodes",
     "make_env",
     "make_highway_env",
+    "misleading_episodes",
     "save_episodes",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +35,7 @@ class Episode:
         instruction: what the passenger says.
         start: x, y (m) and heading (rad).
         path: points ``(x, y)`` that the car should pass, in order, m.
+        stop: whether the car should stand at the path's end; a file says so only where it is true.
 
     Raises:
         ValueError: a field has the wrong form; the message names it and its value.
@@ -46,6 +47,7 @@ class Episode:
     instruction: str
     start: tuple[float, float, float]
     path: tuple[tuple[float, float], ...]
+    stop: bool = False
 
     def __post_init__(self) -> None:
         for name in ("id", "town", "keyword", "instruction"):
@@ -57,6 +59,8 @@ class Episode:
             raise ValueError(f"path is {self.path!r}; give at least one point [x, y]")
         path = tuple(_numbers(f"path point {k}", point, 2) for k, point in enumerate(self.path))
         object.__setattr__(self, "path", path)
+        if not isinstance(self.stop, bool):
+            raise ValueError(f"stop is {self.stop!r}; make it true or false")
         Tokenizer()([self.instruction])
 
     def route(self, town: Town) -> Route:
@@ -116,19 +120,24 @@ def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout",
         for k, route in routes.items():
             start = rng.uniform(0, min(START_BEFORE_JUNCTION, float(town.lane_length[route.lanes[0]])))
             end = min(rng.uniform(*END_BEHIND_JUNCTION), float(town.lane_length[route.lanes[-1]]))
-            driven = Route(town, route.lanes, float(town.lane_length[route.lanes[0]]) - start, end)
-            poses = driven.poses().tolist()
-            episodes.append(
-                Episode(
-                    id=f"{town.name}-{keyword.name.replace(',', '-').replace(' ', '-')}-{k}",
-                    town=town.name,
-                    keyword=keyword.name,
-                    instruction=sentences.sample(keyword, rng),
-                    start=tuple(round(v, 3) for v in poses[0]),
-                    path=tuple((round(x, 2), round(y, 2)) for x, y, _ in poses),
-                )
-            )
+            name = f"{keyword.name.replace(',', '-').replace(' ', '-')}-{k}"
+            driven = replace(route, start=float(town.lane_length[route.lanes[0]]) - start, end=end)
+            episodes.append(episode_along(driven, name, keyword, sentences.sample(keyword, rng)))
     return episodes
+
+
+def episode_along(route: Route, name: str, keyword: Keyword, instruction: str) -> Episode:
+    """The episode that drives a route from its start to its end, ``id`` the town's name and then ``name``."""
+    poses = route.poses().tolist()
+    return Episode(
+        id=f"{route.town.name}-{name}",
+        town=route.town.name,
+        keyword=keyword.name,
+        instruction=instruction,
+        start=tuple(round(v, 3) for v in poses[0]),
+        path=tuple((round(x, 2), round(y, 2)) for x, y, _ in poses),
+        stop=route.stops,
+    )
 
 
 def save_episodes(episodes: Iterable[Episode], path: str | Path) -> None:
@@ -138,7 +147,9 @@ def save_episodes(episodes: Iterable[Episode], path: str | Path) -> None:
         episodes: what to write.
         path: the file.
     """
-    Path(path).write_text("".join(json.dumps(asdict(episode)) + "\n" for episode in episodes), encoding="utf-8")
+    # What is not said to stop does not, so that a file needs no more fields than it had before there were stops.
+    records = ({k: v for k, v in asdict(episode).items() if v is not False} for episode in episodes)
+    Path(path).write_text("".join(json.dumps(record) + "\n" for record in records), encoding="utf-8")
 
 
 def load_episodes(path: str | Path, towns: dict[str, Town] | None = None) -> list[Episode]:
@@ -187,7 +198,7 @@ def _parse(line: str) -> Episode:
     missing = [name for name in FIELDS if name not in record]
     if missing:
         raise ValueError(f"{', '.join(missing)} missing; an episode has {', '.join(FIELDS)}")
-    return Episode(**{name: record[name] for name in FIELDS})
+    return Episode(**{name: record[name] for name in FIELDS}, stop=record.get("stop", False))
 
 
 def _town(name: str, towns: dict[str, Town], folder: Path) -> Town:

@@ -104,6 +104,7 @@ class TownEnv(EnvBase):
         self._steps = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         self._standing = torch.zeros(num_cars, dtype=torch.long, device=self.device)
         self._goal = torch.full((num_cars,), math.inf, device=self.device)
+        self._stop = torch.zeros(num_cars, dtype=torch.bool, device=self.device)
         self._limit = torch.full((num_cars,), max_steps, device=self.device)
         self._on_street = (self.town.lane_manoeuvre == SubTask.LANEFOLLOW).nonzero().squeeze(-1)
         self._plan = torch.zeros(num_cars, 1, dtype=torch.long, device=self.device)
@@ -158,6 +159,7 @@ class TownEnv(EnvBase):
         self._plan_start = torch.tensor([route.start for route in routes], device=self.device)
         self._plan_pose = torch.tensor([e.start for e in episodes], dtype=torch.float64, device=self.device)
         self._goal = torch.tensor([route.length for route in routes], device=self.device)
+        self._stop = torch.tensor([episode.stop for episode in episodes], device=self.device)
         seconds = [1.5 * route.length / vehicle.CRUISE_SPEED + PATIENCE for route in routes]
         self._limit = torch.tensor([math.ceil(s / vehicle.TIME_STEP) for s in seconds], device=self.device)
 
@@ -278,7 +280,8 @@ class TownEnv(EnvBase):
         out[keys.ROUTE] = self._route.short()
         out[keys.ROUTE_POSITION] = self._position.unsqueeze(-1)
         out[keys.PROGRESS] = self._progress.unsqueeze(-1)
-        out[keys.REMAINING] = (self._goal - self._progress).unsqueeze(-1)
+        rolls = vehicle.rolling_distance(self._state[:, 3].float()) * self._stop
+        out[keys.REMAINING] = (self._goal - self._progress - rolls).unsqueeze(-1)
         out[keys.CROSS_TRACK_ERROR] = cross_track.unsqueeze(-1)
         out[keys.OFF_ROAD] = (beyond_edge > 0).any(-1, keepdim=True)
         out[keys.WRONG_LANE] = oncoming.sum(-1, keepdim=True) >= WRONG_LANE_CORNERS

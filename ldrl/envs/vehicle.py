@@ -22,6 +22,7 @@ __all__ = [
     "bicycle_step",
     "footprint",
     "overlap",
+    "rolling_distance",
     "steer_towards",
     "throttle_for",
 ]
@@ -89,6 +90,18 @@ def throttle_for(acceleration: Tensor, speed: Tensor) -> Tensor:
 
 def _resistance(speed: Tensor) -> Tensor:
     return (SETTLING_RATE * speed).clamp(-ROLLING_RESISTANCE, ROLLING_RESISTANCE)
+
+
+def rolling_distance(speed: Tensor) -> Tensor:
+    """How far the car rolls without throttle until it stands, within 0.3 m: ``speed^2 / (2 * 1.5)``.
+
+    Args:
+        speed: ``[*B]``, m/s.
+
+    Returns:
+        ``[*B]``, m.
+    """
+    return speed.square() / (2 * ROLLING_RESISTANCE)
 
 
 def bicycle_step(state: Tensor, steering_angle: Tensor, acceleration: Tensor) -> Tensor:

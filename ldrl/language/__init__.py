@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
-from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
+from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
 from ldrl.language.passenger import MEANINGFUL, Passenger
 from ldrl.language.sentences import Sentences, Split
 from ldrl.language.tokens import MAX_TOKENS, PADDING, UNKNOWN, Tokenizer, normalise
@@ -14,7 +14,8 @@ __all__ = [
     "MAX_TOKENS",
     "MEANINGFUL",
     "PADDING",
-    "Passenger",
+from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
+from ldrl.language.passenger import MEANINGFUL, Passenger
     "UNKNOWN",
     "Glove",
     "Keyword",

@@ -1,20 +1,20 @@
 """The 14 keywords that instructions stand for, each an automaton over junctions.
 
 A sentence says one keyword. What that keyword asks for depends on the junctions that the car meets: "second left"
-passes one street on the left, however many junctions that takes. Planning routes, labelling states and finding
-instructions that the map does not allow all run the same automaton, :meth:`Keyword.step`.
+passes one street on the left, however many junctions that takes. Planning routes, labelling states and the safe answer
+to instructions that the map does not allow all run the same automaton, :meth:`Keyword.step`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from ldrl.subtasks import SubTask
 
-__all__ = ["KEYWORDS", "Keyword", "realised_by"]
+__all__ = ["KEYWORDS", "SAFE_KEYWORDS", "Keyword", "realised_by"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,9 @@ class Keyword:
             ``"ordinal"`` counts the streets on one side and goes straight until the one that is meant.
         manoeuvres: the manoeuvres that the name mentions, in order; one for an ordinal.
         count: the state in which the keyword is done: manoeuvres to make, or for an ordinal streets to count.
+        safe: what to do where the junction does not allow what is asked for. True goes straight instead of an
+            impossible turn and stops (``FINISH``) where straight on is impossible (paper's safe behaviour); False
+            gives up.
 
     Examples:
         >>> keyword = Keyword.parse("(First, left)")
@@ -38,12 +41,17 @@ class Keyword:
         >>> manoeuvre, state = keyword.step(state, {SubTask.LEFT, SubTask.RIGHT})
         >>> manoeuvre.name, keyword.done(state)
         ('LEFT', True)
+        >>> SAFE_KEYWORDS["left"].step(0, {SubTask.RIGHT, SubTask.STRAIGHT})[0].name
+        'STRAIGHT'
+        >>> SAFE_KEYWORDS["straight"].step(0, {SubTask.LEFT, SubTask.RIGHT})[0].name
+        'FINISH'
     """
 
     name: str
     type: Literal["single", "double", "ordinal"]
     manoeuvres: tuple[SubTask, ...]
     count: int
+    safe: bool = False
 
     @classmethod
     def parse(cls, value: str | Keyword) -> Keyword:
@@ -84,8 +92,8 @@ class Keyword:
             options: the manoeuvres that the junction offers on the car's approach.
 
         Returns:
-            The manoeuvre that the instruction asks for and the next state, or None where the junction does not
-            allow it.
+            The manoeuvre that the instruction asks for and the next state. Where the junction does not allow it: None,
+            or with ``safe`` the safe answer, after which a stop is done and ``STRAIGHT`` goes on to what comes next.
 
         Raises:
             ValueError: the keyword is done in this state, so it asks for nothing.
@@ -99,18 +107,27 @@ class Keyword:
         else:
             manoeuvre = self.manoeuvres[state]
             state += 1
-        return (manoeuvre, state) if manoeuvre in options else None
+        if manoeuvre in options:
+            return manoeuvre, state
+        if not self.safe:
+            return None
+        return (SubTask.STRAIGHT, state) if SubTask.STRAIGHT in options else (SubTask.FINISH, self.count)
 
 
-def realised_by(manoeuvres: Sequence[SubTask], options: Sequence[Collection[SubTask]]) -> list[Keyword]:
+def realised_by(
+    manoeuvres: Sequence[SubTask],
+    options: Sequence[Collection[SubTask]],
+    keywords: Iterable[Keyword] | None = None,
+) -> list[Keyword]:
     """Lists the keywords that ask for exactly these manoeuvres at these junctions, done at the last one.
 
     Args:
         manoeuvres: what the car does at each junction, in order.
         options: what each of these junctions offers.
+        keywords: those to look through; by default :data:`KEYWORDS`.
 
     Returns:
-        The keywords in the order of :data:`KEYWORDS`; none for no junction.
+        The keywords in their order; none for no junction.
 
     Raises:
         ValueError: there are not as many manoeuvres as junctions.
@@ -124,7 +141,8 @@ def realised_by(manoeuvres: Sequence[SubTask], options: Sequence[Collection[SubT
     """
     if len(manoeuvres) != len(options):
         raise ValueError(f"{len(manoeuvres)} manoeuvres at {len(options)} junctions: give the options of each junction")
-    return [keyword for keyword in KEYWORDS.values() if _chooses(keyword, manoeuvres, options)]
+    keywords = KEYWORDS.values() if keywords is None else keywords
+    return [keyword for keyword in keywords if _chooses(keyword, manoeuvres, options)]
 
 
 def _chooses(keyword: Keyword, manoeuvres: Sequence[SubTask], options: Sequence[Collection[SubTask]]) -> bool:
@@ -167,5 +185,10 @@ KEYWORDS: dict[str, Keyword] = {
     )
 }
 """Every keyword by its canonical name."""
+
+SAFE_KEYWORDS: dict[str, Keyword] = {
+    name: replace(keyword, safe=True) for name, keyword in KEYWORDS.items() if keyword.type != "ordinal"
+}
+"""Singles and doubles with a safe answer to what the map does not allow; an ordinal waits for its street instead."""
 
 _BY_WORDS = {tuple(name.replace(",", " ").split()): keyword for name, keyword in KEYWORDS.items()}

@@ -34,7 +34,7 @@ class Command(Protocol):
         """The state before the first junction."""
 
     def step(self, state: int, options: Collection[SubTask]) -> tuple[SubTask, int] | None:
-        """The manoeuvre to take at a junction, and the next state."""
+        """The manoeuvre to take at a junction, ``FINISH`` to stop before it, and the next state."""
 
     def done(self, state: int) -> bool:
         """Whether nothing is left to do."""
@@ -49,12 +49,14 @@ class Route:
         lanes: lane indices, each a successor of the one before.
         start: where on the first lane it starts, m.
         end: where on the last lane it ends, m.
+        stops: whether it ends before a junction that the car must not enter.
     """
 
     town: Town
     lanes: tuple[int, ...]
     start: float
     end: float
+    stops: bool = False
 
     @property
     def length(self) -> float:
@@ -93,7 +95,8 @@ def plan_route(town: Town, command: Command, approach: int) -> Route:
         approach: index of the first lane, see :meth:`Town.approaches`.
 
     Returns:
-        The route, from the start of ``approach`` to the end of the lane after the last manoeuvre.
+        The route, from the start of ``approach`` to the end of the lane after the last manoeuvre, or of the lane
+        before the junction that the command stops at.
 
     Raises:
         UnrealisableError: a junction on the way does not offer what is asked for, or the way loops forever.
@@ -107,6 +110,9 @@ def plan_route(town: Town, command: Command, approach: int) -> Route:
         # What the passenger sees: a street on the left counts, even where this lane does not lead into it.
         options = dict.fromkeys(option for way in ways.values() for option in town.lane_options[way[-1]])
         choice = command.step(state, options)
+        if choice is not None and choice[0] == SubTask.FINISH:
+            lanes += next(iter(ways.values()))[:-1]
+            return Route(town, tuple(lanes), 0.0, float(town.lane_length[lanes[-1]]), stops=True)
         if choice is None or choice[0] not in ways:
             offered = ", ".join(option.name.lower() for option in ways)
             raise UnrealisableError(f"{command.name!r} meets a junction of {town.name!r} that offers only {offered}")

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -105,6 +106,26 @@ def test_judged_by_hand(made, success, strict):
     outcome = _judge(EPISODE, made)
     assert (outcome.success, outcome.strict_success) == (success, strict)
     assert outcome.episode is EPISODE
+
+
+@pytest.mark.parametrize(
+    ("made", "success", "strict"),
+    [
+        (drive(along(), finish=58, speed=0.05), True, True),
+        (drive(along(), finish=58, speed=0.2), False, False),  # still rolls
+        (drive(along(39.5), finish=58, speed=0.0), True, True),
+        (drive(along(40.5), finish=58, speed=0.0), False, False),  # stands too far on
+        (drive(along(20.5), finish=38, speed=0.0), True, True),
+        (drive(along(60.0) + along()[::-1], finish=58, speed=0.0), False, False),  # was there, but stands elsewhere
+        (drive([*along(), *((30.0, y) for y in range(12))], finish=58, speed=0.0), False, False),  # turned
+        (drive(along(), speed=0.0), True, False),
+        (drive(along(), finish=29, speed=0.0), True, False),
+        (drive(along(), finish=58, speed=0.0, collision=60), False, False),
+    ],
+)
+def test_stops_judged_by_hand(made, success, strict):
+    outcome = _judge(replace(EPISODE, stop=True), made)
+    assert (outcome.success, outcome.strict_success) == (success, strict)
 
 
 def test_what_an_outcome_says():

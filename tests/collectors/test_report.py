@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from ldrl.collectors.evaluation import Outcome
 from ldrl.collectors.report import (
     PAPER,
+    PAPER_MISLEADING,
     check_writable,
     replacing,
     summarise,
@@ -165,6 +167,8 @@ def test_table_stands_beside_the_papers_figures(outcomes):
 
 def test_other_towns_have_no_figure_in_the_paper():
     assert cells(table([outcome(town="elsewhere")]), "elsewhere", "all")[-1] == "-"
+    misled = table([outcome(town="town2", keyword="left,left")], PAPER_MISLEADING)
+    assert cells(misled, "town2", "double")[-1] == "0.928"
     assert PAPER["town2"] == {"single": 1.0, "double": 0.986, "ordinal": 0.938, "all": 0.97}
 
 
@@ -198,6 +202,16 @@ def test_report_says_what_happened(changes, happened):
     assert cells(text, "bad") == ["turn left", "no", happened]
     assert "good" not in text
     assert "Episodes without strict success: 1" in text
+
+
+def test_report_says_who_drove_on():
+    def drove_on(**changes):
+        bad = outcome("bad", success=False, strict=False, **changes)
+        return cells(to_markdown([replace(bad, episode=replace(bad.episode, stop=True))]), "bad")[2]
+
+    assert drove_on() == "did not stop at the end of the path"
+    assert drove_on(collision=True) == "collision"
+    assert drove_on(largest_gap=12.0) == "missed the path by 12.0 m"
 
 
 def test_report_counts_the_stuck(outcomes):

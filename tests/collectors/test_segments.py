@@ -1,5 +1,6 @@
 """Segments against the planner, and the decisions that are drawn from them."""
 
+import random
 from itertools import pairwise
 
 import pytest
@@ -7,8 +8,10 @@ import torch
 from torchrl.data import TensorDictReplayBuffer
 
 from ldrl import keys
-from ldrl.collectors import BoundarySampler, cut_snippets, find_segments, segments
-from ldrl.language import KEYWORDS, Tokenizer
+from ldrl.collectors import BoundarySampler, cut_snippets, find_misleading, find_segments, segments
+from ldrl.collectors.demonstrations import TRAJECTORY
+from ldrl.envs.misleading import misleading_routes
+from ldrl.language import KEYWORDS, SAFE_KEYWORDS, Tokenizer
 from ldrl.modules import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import UnrealisableError, plan_route, plan_routes
@@ -199,6 +202,101 @@ def test_decisions_lie_where_they_are_due(sampled, labels):
     assert 200 < on_the_way < 600
 
 
+def test_without_misleading_instructions_the_draws_stay_what_they_were(demonstrations, town2, say, labels):
+    """Every number that is drawn, one by one: trainings are reproducible across versions."""
+    subtask, drive, lane = labels
+    snippets = cut_snippets(subtask, drive)
+    found, rng = find_segments(town2, snippets, lane), random.Random(7)
+    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0, seed=7)
+    index, _ = sampler.sample(demonstrations.storage, 20 * sampler.decisions)
+    for frames in index.view(20, -1).tolist():
+        segment = rng.choice(found[rng.choice(list(KEYWORDS.values())).name]).snippets
+        boundary = int(snippets.start[segment[1]])
+        earliest = snippets.start[segment[0]] if rng.random() < 0.25 else max(snippets.start[segment[0]], boundary - 70)
+        frame = rng.randint(int(earliest), boundary + 16)
+        assert frames[0] == frame
+        for _ in segment[1 + (frame >= boundary) :]:
+            rng.randint(-4, 8)
+        rng.random()  # whether the sentence is disturbed
+        if rng.random() < 0.03:
+            rng.random()
+            for _ in rng.choices(sampler._words, k=rng.randint(1, 12)):
+                rng.random()
+    assert sampler.state_dict()["random"] == rng.getstate()
+
+
+def test_every_misleading_route_is_a_segment(town):
+    for name in SAFE_KEYWORDS:
+        for route in misleading_routes(town, name):
+            lanes = list(route.lanes)
+            if route.stops:  # whatever the car does there
+                lanes.append(town.successors(lanes[-1])[-1])
+            lane = torch.tensor(lanes).repeat_interleave(10)
+            subtask = town.lane_manoeuvre[lane]
+            snippets = cut_snippets(subtask, torch.zeros_like(lane))
+            answer = (*route.manoeuvres, FINISH) if route.stops else route.manoeuvres
+            whole = segments.Segment(tuple(range(len(snippets.subtask))), answer)
+            for most in (1, 2, 3):
+                groups = find_misleading(town, snippets, lane, most)[name]
+                assert ([whole] in groups) == (len(answer) <= most)
+            assert whole not in find_segments(town, snippets, lane)[name]
+
+
+def safe_answers(town, keyword, junctions):
+    """By the paper's rule, at the junction lanes that a car crosses, and whether the map misleads the keyword there."""
+    answers, misled = [], False
+    for asked, junction in zip(keyword.manoeuvres, junctions, strict=False):
+        offered = {int(town.lane_manoeuvre[k]) for k in town.successors(int(town.lane_predecessor[junction]))}
+        misled |= asked not in offered
+        if asked not in offered and SubTask.STRAIGHT not in offered:
+            return [*answers, FINISH], misled
+        answers.append(asked if asked in offered else SubTask.STRAIGHT)
+    return answers, misled
+
+
+def test_misleading_decisions_are_the_safe_ones(demonstrations, town2, say, labels):
+    subtask, drive, lane = labels
+    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0, misleading=1.0)
+    index, info = sampler.sample(demonstrations.storage, 600 * sampler.decisions)
+    shape = (600, sampler.decisions)
+    rows = index.view(shape), {key: value.view(*shape, *value.shape[1:]) for key, value in info.items()}
+    count, at_once = {}, 0
+    for name, frames, target, _ in sequences(rows):
+        if name is None:
+            continue
+        ahead = lane[frames[0] :][drive[frames[0] :] == drive[frames[0]]]
+        crossed = [k for k in ahead.unique_consecutive().tolist() if town2.lane_manoeuvre[k] != FOLLOW]
+        answers, misled = safe_answers(town2, KEYWORDS[name], crossed)
+        assert misled
+        stops = answers[-1] == FINISH
+        assert [k for k in target if k != FOLLOW] == (answers if stops else [*answers, FINISH])
+        assert all((a == FOLLOW) != (b == FOLLOW) for a, b in pairwise(target[:-1] if not stops else target))
+        if answers == [FINISH]:
+            # At once where the junction is in sight: the manoeuvre there begins at most 18 frames on.
+            near = bool((subtask[frames[0] : frames[0] + 19] != FOLLOW).any())
+            assert target == ([FINISH] if near else [FOLLOW, FINISH])
+            at_once += near
+        count.setdefault(name, []).append(tuple(answers))
+    assert set(count) == set(SAFE_KEYWORDS)
+    assert at_once > 20
+    for name, found in count.items():
+        assert 35 < len(found) < 90, name
+        assert len(found) / len(set(found)) * 0.5 < min(map(found.count, set(found))), name
+
+
+def test_misleading_is_a_share(demonstrations, town2, say):
+    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0, misleading=0.25)
+    index, info = sampler.sample(demonstrations.storage, 800 * sampler.decisions)
+    shape = (800, sampler.decisions)
+    rows = index.view(shape), {key: value.view(*shape, *value.shape[1:]) for key, value in info.items()}
+    misled = [
+        [k for k in target if k not in (FOLLOW, FINISH)] != list(KEYWORDS[name].manoeuvres)
+        for name, _, target, _ in sequences(rows)
+        if name in SAFE_KEYWORDS
+    ]
+    assert 0.25 * 0.8 * 800 < sum(misled) < 0.25 * 1.2 * 800
+
+
 def test_splits(demonstrations, town2, say):
     BoundarySampler(demonstrations, town2)
     BoundarySampler(demonstrations, town2, split="heldout")
@@ -242,10 +340,16 @@ def test_state_goes_on_where_it_was(demonstrations, town2, tmp_path):
     assert torch.equal(fresh.sample(demonstrations.storage, 4 * sampler.decisions)[0], expected)
 
 
-def test_errors_say_what_to_do(demonstrations, few, town2):
+def test_errors_say_what_to_do(demonstrations, few, town2, monkeypatch):
     sampler = BoundarySampler(demonstrations, town2)
     size = sampler.decisions + 1
     with pytest.raises(ValueError, match=f"batch of {size} does not divide into sequences of {size - 1} decisions"):
         sampler.sample(demonstrations.storage, size)
     with pytest.raises(ValueError, match=r"no drive in 60 frames realises .*second right; collect more"):
         BoundarySampler(few, town2)
+    stored = few.storage[:]
+    snippets = cut_snippets(stored[keys.SUBTASK], stored[TRAJECTORY])
+    nothing = find_misleading(town2, snippets, stored[keys.ROUTE][:, 1].long())
+    monkeypatch.setattr(segments, "find_misleading", lambda *_: nothing)
+    with pytest.raises(ValueError, match=r"no drive in 19200 frames is misled by left, .*; collect more"):
+        BoundarySampler(demonstrations, town2, misleading=0.1)

@@ -80,6 +80,14 @@ def test_there_and_back(tmp_path, episodes):
     assert list(first) == ["id", "town", "keyword", "instruction", "start", "path"]
 
 
+def test_stops_are_said_and_nothing_else(tmp_path):
+    stops, drives = Episode(**LINE, stop=True), Episode(**LINE)
+    save_episodes([stops, drives], tmp_path / "episodes.jsonl")
+    assert [("stop" in line) for line in (tmp_path / "episodes.jsonl").read_text("utf-8").splitlines()] == [True, False]
+    assert load_episodes(tmp_path / "episodes.jsonl") == [stops, drives]
+    assert not load_episodes(write(tmp_path, {**LINE, "stop": False}))[0].stop
+
+
 @pytest.mark.parametrize(
     "name", ["", " a ", "é 🚗\n\t\"'\\", "\u2028\u2029\x85\x0c\x1c", "\ud800", "0", "x" * 10_000, "../../etc", "null"]
 )
@@ -138,6 +146,7 @@ def test_odd_instructions_are_no_errors(tmp_path, instruction):
         ({**LINE, "path": [[1, 2], [1, 2, 3]]}, r"path point 1 is \[1, 2, 3\]; give 2 finite numbers"),
         ({**LINE, "path": [[1, 2], [math.nan, 2]]}, r"path point 1 is \[nan, 2\]; give 2 finite numbers"),
         ({**LINE, "path": [1, 2]}, "path point 0 is 1; give 2 finite numbers"),
+        ({**LINE, "stop": "yes"}, "stop is 'yes'; make it true or false"),
         ({**LINE, "start": [40, 30, 0]}, "episode 'a': start .* is 2.* m from the nearest lane of 'town1'; move it"),
         ({**LINE, "start": [40, 2, 3.1]}, "episode 'a': start .* faces against its lane"),
         ({**LINE, "path": [[45, 2], [50, 20]]}, "episode 'a': path point 1 .* is 1.* m from the nearest lane"),

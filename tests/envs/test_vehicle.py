@@ -43,6 +43,14 @@ def test_rolls_to_a_stop_within_12_metres():
     assert speeds[-1] < 1e-6
 
 
+@pytest.mark.parametrize("speed", [0.2, 1.0, 4.7, 20 / 3.6])
+def test_rolling_distance_is_how_far_it_rolls(speed):
+    state, zero = torch.tensor([0.0, 0.0, 0.0, speed], dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
+    for _ in range(100):
+        state = vehicle.bicycle_step(state, zero, vehicle.acceleration(zero, state[3]))
+    assert float(vehicle.rolling_distance(torch.tensor(speed))) == pytest.approx(float(state[0]), abs=0.3)
+
+
 def test_brake():
     throttle, speed = torch.tensor([-1.0, -0.5, -1.0, -0.1]), torch.tensor([5.0, 5.0, 0.3, 0.0])
     assert vehicle.acceleration(throttle, speed).tolist() == pytest.approx([-7.5, -4.5, -3.0, 0.0])

@@ -3,10 +3,11 @@ import random
 
 import pytest
 
-from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
+from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
 from ldrl.subtasks import MANOEUVRES, SubTask
 
 L, R, S = MANOEUVRES
+F = SubTask.FINISH
 OPTIONS = [set(some) for size in (1, 2, 3) for some in itertools.combinations(MANOEUVRES, size)]
 
 
@@ -81,6 +82,36 @@ def test_parse_names_the_unknown_value_and_all_keywords(spelling):
 )
 def test_automaton_by_hand(name, options, expected):
     assert walk(KEYWORDS[name], options) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "expected"),
+    [
+        ("left", [{L, R}], [L]),
+        ("left", [{R, S}], [S]),
+        ("left", [{R}], [F]),
+        ("straight", [{L, R}], [F]),
+        ("left,right", [{R, S}, {L, R}], [S, R]),
+        ("left,right", [{L, R}, {L, S}], [L, S]),
+        ("left,right", [{R, S}, {L, S}], [S, S]),
+        ("left,straight", [{L, S}, {L, R}], [L, F]),
+        ("left,straight", [{R, S}, {L, R}], [S, F]),
+        ("straight,straight", [{L, R}, {L, S}], [F]),
+        ("straight,straight", [{L, S}, {L, R}], [S, F]),
+    ],
+)
+def test_safe_answers_by_hand(name, options, expected):
+    assert walk(SAFE_KEYWORDS[name], options) == expected
+
+
+def test_safe_keywords_do_what_is_said_where_they_can():
+    assert list(SAFE_KEYWORDS) == [name for name, keyword in KEYWORDS.items() if keyword.type != "ordinal"]
+    for name, safe in SAFE_KEYWORDS.items():
+        for options in itertools.product(OPTIONS, repeat=2):
+            asked, done = walk(KEYWORDS[name], options), walk(safe, options)
+            assert done == asked or (asked is None and (S in done or done[-1] == F))
+            assert safe in realised_by(done, options[: len(done)], SAFE_KEYWORDS.values())
+            assert (KEYWORDS[name] in realised_by(done, options[: len(done)])) == (asked is not None)
 
 
 def test_second_left_counts_only_streets_on_the_left():
