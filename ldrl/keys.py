@@ -27,6 +27,7 @@ __all__ = [
     "OFF_ROAD",
     "PLANNED_TOKENS",
     "POSE",
+    "PREVIOUS_ACTION",
     "PREVIOUS_SUBTASK",
     "PROGRESS",
     "REMAINING",
@@ -94,6 +95,8 @@ AGENT_SUBTASK = (AGENT, "subtask")
 """The sub-task under way, ``[*B]`` int64."""
 PREVIOUS_SUBTASK = (AGENT, "previous_subtask")
 """The sub-task before the one to decide on, ``[*B]`` int64, 5 at an instruction's first decision."""
+PREVIOUS_ACTION = (AGENT, "previous_action")
+"""The action before, ``[*B, 2]`` float32, zero at an instruction's first."""
 SUBTASK_LOGITS = (AGENT, "subtask_logits")
 """The high-level policy's output, ``[*B, 5]`` float32."""
 HIGH_LEVEL_STATE = (AGENT, "high_level_state")

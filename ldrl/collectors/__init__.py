@@ -1,6 +1,7 @@
 """The expert, demonstrations and what is sampled from them, evaluation and reports."""
 
 from ldrl.collectors.demonstrations import SteeringNoise, collect_demonstrations
+from ldrl.collectors.drives import DriveSampler, OncePerFrame
 from ldrl.collectors.evaluation import Outcome, evaluate
 from ldrl.collectors.expert import Expert, expert_action
 from ldrl.collectors.segments import BoundarySampler, Segment, find_misleading, find_segments
@@ -9,7 +10,9 @@ from ldrl.collectors.snippets import DisturbedView, Snippets, SnippetSampler, cu
 __all__ = [
     "BoundarySampler",
     "DisturbedView",
+    "DriveSampler",
     "Expert",
+    "OncePerFrame",
     "Outcome",
     "Segment",
     "SnippetSampler",

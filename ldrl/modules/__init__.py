@@ -1,28 +1,43 @@
-"""Networks as TensorDictModules, and the agent that they make."""
+"""Networks as TensorDictModules, and the agents that they make."""
 
-from ldrl.modules.agent import AgentConfig, HierarchicalAgent
-from ldrl.modules.attention import GatedAttention, LuongAttention
+from ldrl.modules.agent import HierarchicalAgent, make_agent
+from ldrl.modules.attention import Concatenation, GatedAttention, LastWord, LuongAttention
+from ldrl.modules.base import Agent
 from ldrl.modules.checkpoint import PRETRAINED, load_agent, resolve_checkpoint, save_agent
+from ldrl.modules.config import MODELS, AgentConfig, Parts
 from ldrl.modules.controller import SwitchingController
 from ldrl.modules.encoders import ImageEncoder, InstructionEncoder
-from ldrl.modules.high_level import NO_SUBTASK, HighLevelPolicy, HistoryDecoder
-from ldrl.modules.low_level import BranchedGRU, LowLevelPolicy
+from ldrl.modules.high_level import NO_SUBTASK, Decoder, HighLevelPolicy, InstructedPolicy
+from ldrl.modules.low_level import BranchedGRU, LowLevelPolicy, SubtaskGate
+from ldrl.modules.sequences import unroll
+from ldrl.modules.single import SingleAgent, SinglePolicy
 
 __all__ = [
+    "MODELS",
     "NO_SUBTASK",
     "PRETRAINED",
+    "Agent",
     "AgentConfig",
     "BranchedGRU",
+    "Concatenation",
+    "Decoder",
     "GatedAttention",
     "HierarchicalAgent",
     "HighLevelPolicy",
-    "HistoryDecoder",
     "ImageEncoder",
+    "InstructedPolicy",
     "InstructionEncoder",
+    "LastWord",
     "LowLevelPolicy",
     "LuongAttention",
+    "Parts",
+    "SingleAgent",
+    "SinglePolicy",
+    "SubtaskGate",
     "SwitchingController",
     "load_agent",
+    "make_agent",
     "resolve_checkpoint",
     "save_agent",
+    "unroll",
 ]

@@ -1,90 +1,34 @@
-"""The hierarchical agent: the paper's figure as one policy."""
+"""The hierarchical agent: the paper's figure as one policy; and the agent of any config."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
-from torchrl.envs import TensorDictPrimer
+from tensordict.utils import NestedKey
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from ldrl import keys
 from ldrl.language import MAX_TOKENS
+from ldrl.modules.base import Agent
+from ldrl.modules.config import AgentConfig
 from ldrl.modules.controller import VOTES, SwitchingController
 from ldrl.modules.encoders import ImageEncoder
 from ldrl.modules.high_level import HighLevelPolicy
-from ldrl.modules.low_level import LowLevelPolicy
+from ldrl.modules.low_level import LowLevelPolicy, SubtaskGate
+from ldrl.modules.single import SingleAgent
 from ldrl.subtasks import SubTask
 
-__all__ = ["AgentConfig", "HierarchicalAgent"]
-
-CHANNELS = {"gs": 1, "ps": 1, "rgb": 3}
-"""Channels of the image by modality."""
+__all__ = ["HierarchicalAgent", "make_agent"]
 
 
-@dataclass(frozen=True)
-class AgentConfig:
-    """Sizes of the agent; the defaults are small enough for two CPU cores, :meth:`paper` gives the paper's.
-
-    Args:
-        modality: what the agent sees: ``"gs"``, ``"ps"`` (one channel) or ``"rgb"``.
-        image_rows: how many rows of the image the encoders see, from the bottom up.
-        conv_channels: of each image encoder's convolutions.
-        features: size of each linear layer behind an image encoder.
-        low_level_hidden: size of a low-level GRU; there are four in each of the two networks.
-        instruction_hidden: size of the instruction's GRU.
-        subtask_embedding: size of the previous sub-task's embedding.
-        high_level_hidden: size of the high-level GRU.
-
-    Raises:
-        ValueError: a size is no whole number above 0, or the modality is unknown.
-    """
-
-    modality: str = "gs"
-    image_rows: int = 48
-    conv_channels: tuple[int, int, int] = (16, 32, 64)
-    features: int = 128
-    low_level_hidden: int = 64
-    instruction_hidden: int = 64
-    subtask_embedding: int = 16
-    high_level_hidden: int = 128
-
-    def __post_init__(self) -> None:
-        if self.modality not in CHANNELS:
-            raise ValueError(f"modality is {self.modality!r}; use one of {', '.join(CHANNELS)}")
-        sizes = {name: value for name, value in vars(self).items() if name not in ("modality", "conv_channels")}
-        if len(self.conv_channels) != 3:
-            raise ValueError(f"conv_channels is {self.conv_channels!r}; give three sizes, one for each convolution")
-        for name, value in (*sizes.items(), *(("conv_channels", value) for value in self.conv_channels)):
-            if type(value) is not int or value < 1:
-                raise ValueError(f"{name} is {value!r}; give a whole number above 0")
-        object.__setattr__(self, "conv_channels", tuple(self.conv_channels))
-
-    @classmethod
-    def paper(cls) -> AgentConfig:
-        """The sizes of the paper's implementation."""
-        return cls(
-            image_rows=88,
-            conv_channels=(256, 64, 64),
-            features=256,
-            low_level_hidden=256,
-            instruction_hidden=32,
-            subtask_embedding=64,
-            high_level_hidden=256,
-        )
-
-
-class HierarchicalAgent(TensorDictModuleBase):
+class HierarchicalAgent(Agent):
     """Language and image in, throttle and steer out: high-level policy, low-level policies, switching controller.
 
-    All parts are attributes and may be replaced by modules with the same keys. The agent's memory lies in the
-    TensorDict under ``"agent"``: :meth:`make_tensordict_primer` gives the transform that an env needs to hold it.
-    A call is one step of a batch of cars; only rows that switch run the high-level policy.
+    All parts are attributes and may be replaced by modules with the same keys. A call is one step of a batch of cars;
+    only rows that switch run the high-level policy.
 
     Args:
-        config: sizes.
+        config: with a hierarchical model; None for the paper's full one.
 
     Examples:
         >>> from ldrl.envs import make_env
@@ -95,45 +39,31 @@ class HierarchicalAgent(TensorDictModuleBase):
     """
 
     def __init__(self, config: AgentConfig | None = None) -> None:
-        super().__init__()
-        self.config = config = AgentConfig() if config is None else config
-
-        def encoder() -> ImageEncoder:
-            return ImageEncoder(CHANNELS[config.modality], config.conv_channels, config.image_rows)
-
-        self.modality = config.modality
-        self.high_level = HighLevelPolicy(
-            encoder=encoder(),
-            channels=config.conv_channels[-1],
-            features=config.features,
-            instruction=config.instruction_hidden,
-            embedding=config.subtask_embedding,
-            hidden=config.high_level_hidden,
-        )
-        sizes = {"features": config.features, "hidden": config.low_level_hidden}
-        self.control = LowLevelPolicy("control", keys.ACTION, 2, encoder=encoder(), **sizes)
-        self.end_of_subtask = LowLevelPolicy("end", keys.END_LOGIT, 1, encoder=encoder(), **sizes)
+        super().__init__(AgentConfig() if config is None else config)
+        if not self.config.parts.hierarchical:
+            raise ValueError(f"model is {self.config.model!r}, which has no hierarchy; use make_agent")
+        self.high_level = HighLevelPolicy(self.config)
+        self.control = self._low_level("control", keys.ACTION, 2)
+        self.end_of_subtask = self._low_level("end", keys.END_LOGIT, 1)
         self.controller = SwitchingController()
-        self.in_keys = [keys.IMAGE, keys.INSTRUCTION_TOKENS, *self._memory]
         self.out_keys = [
             keys.ACTION, keys.AGENT_SUBTASK, keys.AGENT_FINISH, keys.SWITCH, *(("next", *key) for key in self._memory)
         ]  # fmt: skip
 
-    @classmethod
-    def from_pretrained(cls, name: str, device: torch.device | str = "cpu") -> HierarchicalAgent:
-        """A trained agent; see :func:`~ldrl.modules.load_agent`.
-
-        Args:
-            name: a checkpoint that ships with the package, such as ``"hierarchical-gs"``, or a folder.
-            device: where the agent is to run.
-        """
-        from ldrl.modules.checkpoint import load_agent
-
-        return load_agent(name, device)
+    def _low_level(self, name: str, out_key: NestedKey, outputs: int) -> LowLevelPolicy:
+        config = self.config
+        return LowLevelPolicy(
+            name,
+            out_key,
+            outputs,
+            encoder=ImageEncoder(config.image_channels, config.conv_channels, config.image_rows),
+            features=config.features,
+            hidden=config.low_level_hidden,
+            gate=None if config.parts.branched else SubtaskGate(config.subtask_embedding, config.conv_channels[-1]),
+        )
 
     @property
     def _memory(self) -> dict[tuple[str, ...], TensorSpec]:
-        """Key and spec of everything that the agent remembers, for one car."""
         return {
             keys.AGENT_SUBTASK: Categorical(len(SubTask), ()),
             keys.VOTES: Bounded(0, 1, (VOTES,), dtype=torch.bool),
@@ -143,13 +73,6 @@ class HierarchicalAgent(TensorDictModuleBase):
             self.control.state_key: Unbounded((self.control.hidden,)),
             self.end_of_subtask.state_key: Unbounded((self.end_of_subtask.hidden,)),
         }
-
-    def make_tensordict_primer(self) -> TensorDictPrimer:
-        """The transform that gives an env's TensorDict the agent's memory, zero at each reset."""
-        memory = Composite()
-        for key, spec in self._memory.items():
-            memory[key] = spec
-        return TensorDictPrimer(memory, expand_specs=True)
 
     def decide(self, tensordict: TensorDictBase) -> None:
         """Ask the high-level policy in the rows that switch."""
@@ -164,46 +87,38 @@ class HierarchicalAgent(TensorDictModuleBase):
         tensordict[keys.AGENT_SUBTASK][rows] = asked[keys.SUBTASK_LOGITS].argmax(-1)
         tensordict["next", *keys.HIGH_LEVEL_STATE][rows] = asked["next", *keys.HIGH_LEVEL_STATE]
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """One step.
-
-        Args:
-            tensordict: batch size ``[B]`` with ``in_keys``.
-
-        Returns:
-            The same, with ``action``, ``("agent", "subtask")``, ``("agent", "finish")`` and the memory for the next
-            step under ``("next", "agent")``.
-
-        Raises:
-            KeyError: an input or the memory is missing: the env lacks a transform, such as
-                :meth:`make_tensordict_primer`.
-        """
-        missing = [key for key in self.in_keys if key not in tensordict.keys(True, True)]
-        if missing:
-            raise KeyError(
-                f"{missing[0]} is missing; give the env a DashCamera, an Instruction and agent.make_tensordict_primer()"
-            )
-        if tensordict.batch_dims == 0:
-            return tensordict.update(self(tensordict.unsqueeze(0)).squeeze(0))
-        memory = tensordict.select(*self.in_keys)
-        self.controller(memory)
-        self.decide(memory)
-        keep = ~memory[keys.SWITCH]
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.controller(tensordict)
+        self.decide(tensordict)
+        keep = ~tensordict[keys.SWITCH]
         for policy in (self.control, self.end_of_subtask):
-            memory[policy.state_key] = memory[policy.state_key] * keep.unsqueeze(-1)
-            policy(memory)
-        subtask = memory[keys.AGENT_SUBTASK]
+            tensordict[policy.state_key] = tensordict[policy.state_key] * keep.unsqueeze(-1)
+            policy(tensordict)
+        subtask = tensordict[keys.AGENT_SUBTASK]
         finish = subtask == SubTask.FINISH
-        throttle, steer = memory[keys.ACTION].unbind(-1)
-        vote = memory[keys.END_LOGIT] > 0
+        throttle, steer = tensordict[keys.ACTION].unbind(-1)
+        vote = tensordict[keys.END_LOGIT] > 0
         after = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
         after[keys.ACTION] = torch.stack((throttle.clamp(0, 1) * ~finish, steer.clamp(-1, 1)), -1)
         after[keys.AGENT_SUBTASK] = subtask
         after[keys.AGENT_FINISH] = finish
-        after[keys.SWITCH] = memory[keys.SWITCH]
-        after["next"] = memory["next"]
+        after[keys.SWITCH] = tensordict[keys.SWITCH]
+        after["next"] = tensordict["next"]
         after["next", *keys.AGENT_SUBTASK] = subtask
-        after["next", *keys.VOTES] = torch.cat((memory[keys.VOTES][..., 1:] & keep.unsqueeze(-1), vote), -1)
-        after["next", *keys.AGE] = memory[keys.AGE] * keep + 1
-        after["next", *keys.PLANNED_TOKENS] = memory[keys.PLANNED_TOKENS]
-        return tensordict.update(after)
+        after["next", *keys.VOTES] = torch.cat((tensordict[keys.VOTES][..., 1:] & keep.unsqueeze(-1), vote), -1)
+        after["next", *keys.AGE] = tensordict[keys.AGE] * keep + 1
+        after["next", *keys.PLANNED_TOKENS] = tensordict[keys.PLANNED_TOKENS]
+        return after
+
+
+def make_agent(config: AgentConfig) -> Agent:
+    """The untrained agent of a config.
+
+    Args:
+        config: its model says which class.
+
+    Examples:
+        >>> type(make_agent(AgentConfig(model="single-history"))).__name__
+        'SingleAgent'
+    """
+    return HierarchicalAgent(config) if config.parts.hierarchical else SingleAgent(config)

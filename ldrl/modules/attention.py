@@ -1,10 +1,11 @@
-"""Attention: over the words of the instruction, and over the channels of the image."""
+"""Attention: over the words of the instruction, and over the channels of the image; and what does without."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
-__all__ = ["GatedAttention", "LuongAttention"]
+__all__ = ["Concatenation", "GatedAttention", "LastWord", "LuongAttention"]
 
 
 class LuongAttention(nn.Module):
@@ -30,7 +31,9 @@ class LuongAttention(nn.Module):
         Returns:
             ``[*B, E]`` float32, the weighted mean of the states; zero where there is no word.
         """
-        score = (self.score(states) @ decoder.unsqueeze(-1)).squeeze(-1)
+        # The same as score(states) @ decoder, but one product per row instead of one per word.
+        query = decoder @ self.score.weight
+        score = (states @ query.unsqueeze(-1)).squeeze(-1)
         # A large finite number, so that a row without words has weights and no NaN.
         weights = score.masked_fill(~is_word, -1e9).softmax(-1) * is_word
         return (weights.unsqueeze(-2) @ states).squeeze(-2)
@@ -59,3 +62,37 @@ class GatedAttention(nn.Module):
             ``[*B, C, H, W]`` float32.
         """
         return features * self.gate(condition).sigmoid()[..., None, None]
+
+
+class LastWord(nn.Module):
+    """The instruction encoder's last state: what a model without attention knows of the sentence."""
+
+    def forward(self, states: Tensor, is_word: Tensor) -> Tensor:
+        """Pick a state.
+
+        Args:
+            states: encoder states, ``[*B, L, E]`` float32.
+            is_word: ``[*B, L]`` bool; True first.
+
+        Returns:
+            ``[*B, E]`` float32, the state behind the last word; zero where there is no word.
+        """
+        length = is_word.sum(-1, keepdim=True)
+        last = states.take_along_dim((length - 1).clamp(min=0).unsqueeze(-1), -2).squeeze(-2)
+        return last * (length > 0)
+
+
+class Concatenation(nn.Module):
+    """Image features and the instruction side by side: the fusion of a model without attention."""
+
+    def forward(self, features: Tensor, condition: Tensor) -> Tensor:
+        """Concatenate.
+
+        Args:
+            features: ``[*B, C, H, W]`` float32.
+            condition: ``[*B, N]`` float32.
+
+        Returns:
+            ``[*B, C H W + N]`` float32.
+        """
+        return torch.cat((features.flatten(-3), condition), -1)

@@ -11,7 +11,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from ldrl.modules.agent import AgentConfig, HierarchicalAgent
+from ldrl.modules.agent import make_agent
+from ldrl.modules.base import Agent
+from ldrl.modules.config import AgentConfig
 
 __all__ = ["PRETRAINED", "load_agent", "resolve_checkpoint", "save_agent"]
 
@@ -22,7 +24,7 @@ PRETRAINED = tuple(sorted(folder.name for folder in SHIPPED.glob("*") if (folder
 """Names of the checkpoints that ship with the package."""
 
 
-def save_agent(agent: HierarchicalAgent, folder: str | Path) -> None:
+def save_agent(agent: Agent, folder: str | Path) -> None:
     """Write a checkpoint; an old one is replaced only once the new one is complete.
 
     Args:
@@ -56,7 +58,7 @@ def resolve_checkpoint(name: str | Path) -> Path:
     )
 
 
-def load_agent(name: str | Path, device: torch.device | str = "cpu") -> HierarchicalAgent:
+def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Agent:
     """Load a checkpoint, ready to drive (in evaluation mode).
 
     Args:
@@ -86,10 +88,10 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Hierarch
     return agent.eval().to(device)
 
 
-def _untrained(path: Path) -> HierarchicalAgent:
+def _untrained(path: Path) -> Agent:
     """The agent of a config file, with random weights."""
     try:
-        return HierarchicalAgent(AgentConfig(**json.loads(path.read_text(encoding="utf-8"))))
+        return make_agent(AgentConfig(**json.loads(path.read_text(encoding="utf-8"))))
     except (ValueError, TypeError, RuntimeError) as error:
         names = ", ".join(field.name for field in fields(AgentConfig))
         raise ValueError(f"{path} is no agent config ({error}); it is a JSON object with {names}") from None

@@ -1,5 +1,5 @@
 """Losses."""
 
-from ldrl.objectives.imitation import ControlLoss, EndOfSubtaskLoss, SubtaskLoss
+from ldrl.objectives.imitation import ControlLoss, EndOfSubtaskLoss, SinglePolicyLoss, SubtaskLoss
 
-__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SubtaskLoss"]
+__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SinglePolicyLoss", "SubtaskLoss"]

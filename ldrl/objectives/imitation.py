@@ -1,4 +1,4 @@
-"""Imitation losses of the three networks (paper, section 4)."""
+"""Imitation losses of the three networks (paper, section 4), and of the single policies."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from tensordict.utils import NestedKey
-from torch import Tensor
 from torch.nn import functional
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 
 from ldrl import keys
-from ldrl.modules import HighLevelPolicy, LowLevelPolicy
+from ldrl.modules import HighLevelPolicy, LowLevelPolicy, SinglePolicy, unroll
 
-__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SubtaskLoss"]
+__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SinglePolicyLoss", "SubtaskLoss"]
 
 
 class _LowLevelLoss(LossModule):
@@ -131,7 +130,6 @@ class SubtaskLoss(LossModule):
     def __init__(self, policy: HighLevelPolicy) -> None:
         super().__init__()
         self._in_keys = None
-        self.hidden = policy.hidden
         self.convert_to_functional(policy, "policy", create_target_params=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -145,24 +143,57 @@ class SubtaskLoss(LossModule):
             ``loss_subtask``, a scalar, zero where all is padding, and ``accuracy_subtask``, the share of
             decisions made right.
         """
-        mask, target = tensordict[self.tensor_keys.mask], tensordict[self.tensor_keys.subtask]
-        logits = self._decide(tensordict, mask)
-        target = torch.cat([target[rows, step] for step, rows in enumerate(mask.unbind(1))])
+        mask, subtask = tensordict[self.tensor_keys.mask], self.tensor_keys.subtask
+        with self.policy_params.to_module(self.policy):
+            made = unroll(self.policy, tensordict.select(*self.policy.in_keys, subtask, strict=False), mask)
+        target, logits = made[subtask], made[keys.SUBTASK_LOGITS]
         decisions = max(len(target), 1)
         loss = functional.cross_entropy(logits, target, reduction="sum") / decisions
         accuracy = (logits.argmax(-1) == target).float().sum() / decisions
         return TensorDict({"loss_subtask": loss, "accuracy_subtask": accuracy})
 
-    def _decide(self, tensordict: TensorDictBase, mask: Tensor) -> Tensor:
-        """Logits of all decisions that are not padding, step by step: ``[mask.sum(), 5]``."""
-        state = torch.zeros(len(tensordict), self.hidden, device=tensordict.device)
-        logits = []
+
+class SinglePolicyLoss(LossModule):
+    """L1 between a single policy's action and the expert's over whole drives; padding counts for nothing.
+
+    A policy with history is told the expert's action of the step before.
+
+    Args:
+        policy: the single policy.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        action: NestedKey = keys.ACTION
+        mask: NestedKey = "mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_action"]  # noqa: RUF012
+    policy: TensorDictModuleBase
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+
+    def __init__(self, policy: SinglePolicy) -> None:
+        super().__init__()
+        self._in_keys = None
+        self.convert_to_functional(policy, "policy", create_target_params=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss.
+
+        Args:
+            tensordict: drives, batch size ``[B, T]``: image, instruction tokens, the expert's ``action``, and ``mask``,
+                False for padding, which is at the end.
+
+        Returns:
+            ``loss_action``, a scalar, zero where all is padding.
+        """
+        target = tensordict[self.tensor_keys.action]
+        inputs = tensordict.select(keys.IMAGE, keys.INSTRUCTION_TOKENS)
+        inputs["target"] = target
+        inputs[keys.PREVIOUS_ACTION] = functional.pad(target[:, :-1], (0, 0, 1, 0))
         with self.policy_params.to_module(self.policy):
-            for step, rows in enumerate(mask.unbind(1)):
-                inputs = tensordict[:, step].select(keys.IMAGE, keys.INSTRUCTION_TOKENS, keys.PREVIOUS_SUBTASK)[rows]
-                inputs[keys.HIGH_LEVEL_STATE] = state[rows]
-                if len(inputs):
-                    self.policy(inputs)
-                    logits.append(inputs[keys.SUBTASK_LOGITS])
-                    state = state.index_put((rows,), inputs["next", *keys.HIGH_LEVEL_STATE])
-        return torch.cat(logits) if logits else state.new_zeros(0, 5)
+            made = unroll(self.policy, inputs, tensordict[self.tensor_keys.mask])
+        gap = (made[keys.ACTION] - made["target"]).abs()
+        return TensorDict({"loss_action": gap.sum() / max(gap.numel(), 1)})

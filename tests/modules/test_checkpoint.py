@@ -137,7 +137,7 @@ def test_one_weight_too_few_or_too_many(saved, change):
 )
 def test_broken_configs(saved, content, message):
     (saved / CONFIG).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{CONFIG} {message}.*it is a JSON object with modality, image_rows"):
+    with pytest.raises(ValueError, match=rf"{CONFIG} {message}.*it is a JSON object with model, modality"):
         load_agent(saved)
 
 

@@ -305,15 +305,15 @@ def test_every_config_key_is_read(recipe):
     assert not unread
 
 
-def test_presets_and_models_have_the_same_keys():
-    for group in ("preset", "model"):
+def test_presets_and_sizes_have_the_same_keys():
+    for group in ("preset", "size"):
         files = sorted((RECIPES / "config" / group).glob("*.yaml"))
         assert len(files) > 1
         found = [set(leaves(yaml.safe_load(file.read_text()))) - {"name"} for file in files]
         assert all(keys == found[0] for keys in found)
 
 
-def test_models_are_agent_configs():
-    models = {file.stem: yaml.safe_load(file.read_text()) for file in (RECIPES / "config" / "model").glob("*.yaml")}
+def test_sizes_are_agent_configs():
+    models = {file.stem: yaml.safe_load(file.read_text()) for file in (RECIPES / "config" / "size").glob("*.yaml")}
     assert AgentConfig(**models["small"]) == AgentConfig()
     assert AgentConfig(**models["paper"]) == AgentConfig.paper()
