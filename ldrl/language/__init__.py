@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from ldrl.language.disturb import MEANINGFUL, disturb
+from ldrl.language.families import Families, Family
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
 from ldrl.language.sentences import Sentences, Split
+from ldrl.language.slips import slip
 from ldrl.language.tokens import MAX_TOKENS, PADDING, UNKNOWN, Tokenizer, normalise
 
 __all__ = [
@@ -15,6 +17,8 @@ __all__ = [
     "MEANINGFUL",
     "PADDING",
     "UNKNOWN",
+    "Families",
+    "Family",
     "Glove",
     "Keyword",
     "Sentences",
@@ -25,4 +29,5 @@ __all__ = [
     "load_glove",
     "normalise",
     "realised_by",
+    "slip",
 ]
