@@ -7,7 +7,6 @@ from ldrl.language.families import Families, Family
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, Keyword, realised_by
 from ldrl.language.sentences import Sentences, Split
-from ldrl.language.slips import slip
 from ldrl.language.tokens import MAX_TOKENS, PADDING, UNKNOWN, Tokenizer, normalise
 
 __all__ = [
@@ -29,5 +28,4 @@ __all__ = [
     "load_glove",
     "normalise",
     "realised_by",
-    "slip",
 ]

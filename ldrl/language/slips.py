@@ -3,84 +3,27 @@
 from __future__ import annotations
 
 import random
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import yaml
 
 from ldrl.language.glove import load_glove
 
-__all__ = ["CRUCIAL", "slip"]
+__all__ = ["slip"]
 
-CRUCIAL = frozenset(
-    "left right straight first second next one two twice both another again once more let skip possible".split()
-)
-"""Words that say which way and how often: never dropped, never doubled, changed at most once each."""
-DROPPABLE = frozenset("a the to you i d s ve we re at this could want like your hey uh well thanks".split())
-"""Words that a listener does not miss."""
 COMMON_WORDS = 40_000
 """A typo makes none of this many commonest words of GloVe, so that it reads as a typo."""
-LEAST_LETTERS = {"typo": 4, "split": 6}
+TYPO_LETTERS, SPLIT_LETTERS = 4, 6
 """Shorter words would be beyond recognition."""
-
-_MISHEARD = {
-    "left": ["lefts", "leff"],
-    "right": ["write", "rite", "wright"],
-    "straight": ["strait", "straights", "straight a", "strate"],
-    "first": ["1st", "firs", "furst"],
-    "second": ["2nd", "seconds", "seconed"],
-    "two": ["too", "to", "2"],
-    "twice": ["twise"],
-    "let": ["led"],
-    "both": ["booth", "bothe"],
-    "one": ["won"],
-    "once": ["ones", "wants"],
-    "more": ["moor", "mor"],
-    "again": ["agen", "a gain"],
-    "another": ["an other", "a nother"],
-    "then": ["than"],
-    "to": ["too", "ta"],
-    "and": ["an", "end"],
-    "the": ["da", "thee"],
-    "a": ["uh", "ay"],
-    "at": ["add", "it"],
-    "hey": ["hay"],
-    "hang": ["hank", "hung"],
-    "turn": ["tern", "turned"],
-    "turns": ["terns"],
-    "take": ["steak", "taken"],
-    "make": ["mike", "made"],
-    "road": ["rode", "rowed"],
-    "street": ["streets", "streat"],
-    "intersection": ["inter section", "intersections", "intersecting"],
-    "corner": ["coroner", "corners"],
-    "afterwards": ["after words"],
-    "after": ["aft her"],
-    "followed": ["follow", "fallowed"],
-    "by": ["buy", "bye"],
-    "through": ["threw", "thru"],
-    "across": ["a cross"],
-    "on": ["own"],
-    "all": ["awl"],
-    "way": ["weigh"],
-    "row": ["roe"],
-    "it": ["et"],
-    "this": ["these", "dis"],
-    "that": ["dat"],
-    "your": ["yore", "you"],
-    "you": ["u", "ya"],
-    "could": ["cud", "good"],
-    "we": ["wee"],
-    "carry": ["carrie"],
-    "drive": ["drives"],
-    "continue": ["continues"],
-    "stay": ["stayed"],
-    "ahead": ["a head"],
-    "thanks": ["thanx", "tanks"],
-    "possible": ["posable"],
-    "side": ["sighed"],
-    "hand": ["and"],
-}
-_KEYS = ("qwertyuiop", "asdfghjkl", "zxcvbnm")
 _GLUE = "+"
 """Before a word: no space here."""
-_MARKS = (",", "...", "!", ".", " -")
+
+
+@cache
+def _tables() -> dict[str, Any]:
+    return yaml.safe_load((resources.files(__package__) / "families" / "noise.yaml").read_text("utf-8"))
 
 
 def slip(sentence: str, rng: random.Random) -> str:
@@ -116,17 +59,16 @@ def slip(sentence: str, rng: random.Random) -> str:
 
 def _slip_word(word: str, is_first: bool, rng: random.Random) -> str | None:
     """One slip in a word; None where the draw does not fit it."""
+    tables = _tables()
     kinds = [] if is_first else ["merge"]
-    if word in _MISHEARD:
-        kinds += ["misheard", "misheard"]
-    kinds += [kind for kind, letters in LEAST_LETTERS.items() if len(word) >= letters for _ in range(2)]
-    if word in DROPPABLE:
-        kinds += ["drop"]
-    if word not in CRUCIAL:
-        kinds += ["double"]
+    kinds += ["misheard"] * 2 * (word in tables["misheard"])
+    kinds += ["typo"] * 2 * (len(word) >= TYPO_LETTERS)
+    kinds += ["split"] * 2 * (len(word) >= SPLIT_LETTERS)
+    kinds += ["drop"] * (word in tables["droppable"])
+    kinds += ["double"] * (word not in tables["crucial"])
     kind = rng.choice(kinds)
     if kind == "misheard":
-        return rng.choice(_MISHEARD[word])
+        return rng.choice(tables["misheard"][word])
     if kind == "typo":
         return _typo(word, rng)
     if kind == "split":
@@ -138,7 +80,7 @@ def _slip_word(word: str, is_first: bool, rng: random.Random) -> str | None:
 def _typo(word: str, rng: random.Random) -> str | None:
     """Swaps, drops, doubles or replaces one letter, never the first."""
     k = rng.randrange(1, len(word))
-    row = next(row for row in _KEYS if word[k] in row)
+    row = next(row for row in _tables()["keyboard"] if word[k] in row)
     at = row.index(word[k])
     neighbour = rng.choice(row[max(at - 1, 0) : at] + row[at + 1 : at + 2])
     typo = rng.choice(
@@ -156,6 +98,6 @@ def _scribble(sentence: str, rng: random.Random) -> str:
     """Careless case and punctuation, which say nothing."""
     words = sentence.split()
     if rng.random() < 0.5:
-        words[rng.randrange(len(words))] += rng.choice(_MARKS)
+        words[rng.randrange(len(words))] += rng.choice(_tables()["marks"])
     case = rng.choice((str, str, str.capitalize, str.upper, str.title))
     return case(" ".join(words))
