@@ -32,7 +32,7 @@ def slip(sentence: str, rng: random.Random) -> str:
     Each slip hits another word: a typo of one letter behind the first one, a word taken for one that sounds alike,
     two words run together, one cut in two, one dropped or doubled. Sentences of up to 4 words get one slip, of up to 9
     words one or two, longer ones up to three. Directions, ordinals and words that say how often are never dropped or
-    doubled. On top come careless case and punctuation.
+    doubled. On top come careless case and punctuation. It is the blind test of noise: do not train with it.
 
     Args:
         sentence: words in lower case, without punctuation.
@@ -52,15 +52,17 @@ def slip(sentence: str, rng: random.Random) -> str:
         position = untouched.pop()
         slipped = None
         while slipped is None:
-            slipped = _slip_word(words[position], position == 0, rng)
+            slipped = _slip_word(words[position], position - 1 in untouched, rng)
         words[position] = slipped
+        if slipped.startswith(_GLUE):
+            untouched.remove(position - 1)
     return _scribble(" ".join(" ".join(words).replace(f" {_GLUE}", "").split()), rng)
 
 
-def _slip_word(word: str, is_first: bool, rng: random.Random) -> str | None:
-    """One slip in a word; None where the draw does not fit it."""
+def _slip_word(word: str, can_merge: bool, rng: random.Random) -> str | None:
+    """One slip in a word, or of it and the one before; None where the draw does not fit it."""
     tables = _tables()
-    kinds = [] if is_first else ["merge"]
+    kinds = ["merge"] * can_merge
     kinds += ["misheard"] * 2 * (word in tables["misheard"])
     kinds += ["typo"] * 2 * (len(word) >= TYPO_LETTERS)
     kinds += ["split"] * 2 * (len(word) >= SPLIT_LETTERS)
@@ -95,7 +97,7 @@ def _typo(word: str, rng: random.Random) -> str | None:
 
 
 def _scribble(sentence: str, rng: random.Random) -> str:
-    """Careless case and punctuation, which say nothing."""
+    """Adds careless case and punctuation, which say nothing."""
     words = sentence.split()
     if rng.random() < 0.5:
         words[rng.randrange(len(words))] += rng.choice(_tables()["marks"])
