@@ -7,9 +7,8 @@ import random
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
-from ldrl.language import KEYWORDS, Keyword, Sentences, Tokenizer
+from ldrl.language import KEYWORDS, Families, Family, Keyword, Sentences, Split, Tokenizer
 from ldrl.towns import Route, Town, UnrealisableError, match_route, plan_routes
 from ldrl.towns.opendrive import load_network
 
@@ -91,7 +90,7 @@ def _is_finite(value: object) -> bool:
     return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
 
 
-def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout", seed: int = 0) -> list[Episode]:
+def builtin_episodes(town: Town, split: Split | Family = "heldout", seed: int = 0) -> list[Episode]:
     """The built-in episodes: the distinct routes of every keyword that the town can realise.
 
     Of a keyword with more than 40 routes, 40 are drawn. Each starts up to 35 m before its first junction and ends 5 to
@@ -99,8 +98,11 @@ def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout",
 
     Args:
         town: the town.
-        split: which sentences the passengers say.
+        split: which sentences the passengers say; nothing else of the episodes depends on it.
         seed: of the starts, ends, sentences and the routes where they are drawn.
+
+    Raises:
+        ValueError: there is no such split.
 
     Examples:
         >>> episodes = builtin_episodes(Town.load("town2"))
@@ -108,7 +110,11 @@ def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout",
         ('town2-left-0', 'left')
     """
     rng = random.Random(f"{town.name}-{seed}")
-    sentences = Sentences(split)
+    heldout = Sentences("heldout")
+    others: Sentences | Families | None = None
+    if split != "heldout":
+        others = Sentences("train") if split == "train" else Families(split)
+    others_rng = random.Random(f"{town.name}-{seed}-{split}")
     episodes = []
     for keyword in KEYWORDS.values():
         try:
@@ -122,7 +128,11 @@ def builtin_episodes(town: Town, split: Literal["train", "heldout"] = "heldout",
             end = min(rng.uniform(*END_BEHIND_JUNCTION), float(town.lane_length[route.lanes[-1]]))
             name = f"{keyword.name.replace(',', '-').replace(' ', '-')}-{k}"
             driven = replace(route, start=float(town.lane_length[route.lanes[0]]) - start, end=end)
-            episodes.append(episode_along(driven, name, keyword, sentences.sample(keyword, rng)))
+            # Drawn for every split: the starts that follow depend on it.
+            instruction = heldout.sample(keyword, rng)
+            if others is not None:
+                instruction = others.sample(keyword, others_rng)
+            episodes.append(episode_along(driven, name, keyword, instruction))
     return episodes
 
 

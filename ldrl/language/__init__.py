@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ldrl.language.families import Families, Family
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
 from ldrl.language.passenger import MEANINGFUL, Passenger
@@ -14,11 +15,13 @@ __all__ = [
     "MAX_TOKENS",
     "MEANINGFUL",
     "PADDING",
-from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
-from ldrl.language.passenger import MEANINGFUL, Passenger
+    "SAFE_KEYWORDS",
     "UNKNOWN",
+    "Families",
+    "Family",
     "Glove",
     "Keyword",
+    "Passenger",
     "Sentences",
     "Split",
     "Tokenizer",

@@ -3,11 +3,13 @@
 import json
 import math
 from collections import Counter
+from dataclasses import replace
+from typing import get_args
 
 import pytest
 
 from ldrl.envs import Episode, builtin_episodes, load_episodes, save_episodes
-from ldrl.language import KEYWORDS, Sentences
+from ldrl.language import KEYWORDS, Family, Sentences
 from ldrl.subtasks import SubTask
 from ldrl.towns import plan_routes
 
@@ -60,6 +62,32 @@ def test_builtin_episodes_are_seeded(town2, episodes):
     assert other != episodes["town2"]
     trained = builtin_episodes(town2, "train")
     assert all(e.instruction in set(Sentences("train").all(e.keyword)) for e in trained[:20])
+
+
+def test_builtin_episodes_stay_as_they_were(episodes):
+    """Reports are compared over the years, so the set is fixed; each episode depends on all draws before it."""
+    assert {town: len(some) for town, some in episodes.items()} == {"town1": 272, "town2": 178}
+    first, last = episodes["town2"][0], episodes["town2"][-1]
+    assert first.start == pytest.approx((20.165, 187.59, 3.142))
+    assert last.start == pytest.approx((189.69, 210.383, 1.571))
+    assert last.instruction == "uh we need to drive down the road and take the second possible right"
+    assert episodes["town1"][-1].start == pytest.approx((334.82, 157.565, 1.571))
+    assert episodes["town1"][-1].instruction == "well second street to the right thanks"
+
+
+@pytest.mark.parametrize("split", ["train", *get_args(Family)])
+def test_other_splits_say_something_else_on_the_same_routes(town2, episodes, split):
+    others = builtin_episodes(town2, split)
+    pairs = list(zip(others, episodes["town2"], strict=True))
+    assert all(replace(other, instruction="same") == replace(clean, instruction="same") for other, clean in pairs)
+    assert all(other.instruction != clean.instruction for other, clean in pairs)
+    assert builtin_episodes(town2, split) == others
+    assert [e.instruction for e in builtin_episodes(town2, split, seed=1)] != [e.instruction for e in others]
+
+
+def test_an_unknown_split_is_refused(town2):
+    with pytest.raises(ValueError, match="unknown family 'test': use one of paraphrase, "):
+        builtin_episodes(town2, "test")
 
 
 def test_of_many_routes_some_are_drawn(town2, episodes, monkeypatch):
