@@ -24,6 +24,7 @@ __all__ = [
     "IMAGE",
     "INSTRUCTION",
     "INSTRUCTION_TOKENS",
+    "KEYWORD",
     "OFF_ROAD",
     "PLANNED_TOKENS",
     "POSE",
@@ -34,6 +35,7 @@ __all__ = [
     "RIGHT_OF_WAY",
     "ROUTE",
     "ROUTE_POSITION",
+    "SAID",
     "SPEED",
     "SUBTASK",
     "SUBTASK_LOGITS",
@@ -53,6 +55,8 @@ INSTRUCTION = INSTRUCTION_KEY
 """The passenger's sentence, text; left out on hot paths."""
 INSTRUCTION_TOKENS = "instruction_tokens"
 """The sentence as vocabulary indices, ``[*B, L]`` int64, 0 is padding."""
+KEYWORD = "keyword"
+"""Label: what a sentence means, an index among the keywords, ``[*B]`` int64."""
 SUBTASK = "subtask"
 """Label: the sub-task that the route asks for here, ``[*B]`` int64."""
 END_OF_SUBTASK = "end_of_subtask"
@@ -99,6 +103,8 @@ PREVIOUS_ACTION = (AGENT, "previous_action")
 """The action before, ``[*B, 2]`` float32, zero at an instruction's first."""
 SUBTASK_LOGITS = (AGENT, "subtask_logits")
 """The high-level policy's output, ``[*B, 5]`` float32."""
+SAID = (AGENT, "said")
+"""What the instruction says, ``[*B, N]`` float32."""
 HIGH_LEVEL_STATE = (AGENT, "high_level_state")
 """The decoder's recurrent state, ``[*B, H]`` float32."""
 END_LOGIT = (AGENT, "end_logit")

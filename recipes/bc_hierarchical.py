@@ -1,9 +1,11 @@
-"""Behaviour cloning of the whole hierarchy: collect, train three networks, evaluate both towns, report.
+"""Behaviour cloning of an agent: collect, train its networks, evaluate both towns, report.
 
-    python recipes/bc_hierarchical.py                   # a laptop's preset
-    python recipes/bc_hierarchical.py preset=smoke      # everything once, to see it run
-    python recipes/bc_hierarchical.py model=paper       # the paper's sizes
-    python recipes/bc_hierarchical.py seed=1 name=seed1
+    python recipes/bc_hierarchical.py                          # a laptop's preset: the full model on gs
+    python recipes/bc_hierarchical.py preset=smoke             # everything once, to see it run
+    python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
+    python recipes/bc_hierarchical.py preset=rgb               # from colour images
+    python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
+    python recipes/bc_hierarchical.py model=h0 start_from=runs/hih stages=[high_level]
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """
@@ -22,149 +24,141 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
+from torch import nn
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers import Sampler, Storage
-from torchrl.envs import Compose, DeviceCastTransform
+from torchrl.data.replay_buffers import Sampler
+from torchrl.envs import Compose, DeviceCastTransform, Transform
 from torchrl.objectives import LossModule
 from torchrl.record import CSVLogger
 from tqdm import tqdm
 
-from ldrl.collectors import BoundarySampler, DisturbedView, SnippetSampler, collect_demonstrations, evaluate
+from ldrl.collectors import (
+    BoundarySampler,
+    DisturbedView,
+    DriveSampler,
+    OncePerFrame,
+    SnippetSampler,
+    collect_demonstrations,
+    collect_sentences,
+    evaluate,
+)
 from ldrl.collectors.plots import plot_losses, plot_tracks
 from ldrl.collectors.report import replacing, table, to_markdown, write_json
-from ldrl.envs import DashCamera, Episode, builtin_episodes
-from ldrl.modules import AgentConfig, HierarchicalAgent, save_agent
-from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, SubtaskLoss
+from ldrl.envs import Episode, builtin_episodes, make_camera, misleading_episodes
+from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
+from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 from ldrl.towns import Town
 
-History = dict[str, list[float]]
+STAGES = ("language", "low_level", "high_level")
 
 
-def fit(
-    cfg: DictConfig,
-    title: str,
-    losses: Sequence[LossModule],
-    buffer: TensorDictReplayBuffer,
-    rows: int,
-    logger: CSVLogger,
-) -> History:
-    """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences."""
-    parameters = [parameter for loss in losses for parameter in loss.parameters()]
-    steps = cfg[f"{title}_steps"]
-    optimizer = torch.optim.Adam(parameters)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, cfg.learning_rate, total_steps=steps, pct_start=0.1)
-    history: History = defaultdict(list)
+class Training:
+    """The stages of a training, each a buffer and losses."""
 
-    def update(batch: TensorDictBase) -> dict[str, float]:
-        outputs = [loss(batch) for loss in losses]
-        sum(value for output in outputs for name, value in output.items() if name.startswith("loss_")).backward()
-        torch.nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
-        optimizer.step()
-        optimizer.zero_grad()
-        schedule.step()
-        return {name: float(value) for output in outputs for name, value in output.items()}
+    def __init__(self, cfg: DictConfig, agent: Agent, folder: Path) -> None:
+        self.cfg, self.agent = cfg, agent
+        self.town = Town.load(cfg.town)
+        shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
+        self.logger = CSVLogger("log", str(folder))
+        self.history: dict[str, list[float]] = {}
+        path = folder / "demonstrations"
+        self.demonstrations = collect_demonstrations(self.town, cfg.demonstration_frames, path=path, seed=cfg.seed)
+        self.policy = agent.high_level if isinstance(agent, HierarchicalAgent) else agent.policy
 
-    bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
-    for step in bar:
-        measured = update(buffer.sample().reshape(rows, -1))
-        bar.set_postfix({name.removeprefix("loss_"): f"{value:.3f}" for name, value in measured.items()})
-        for name, value in measured.items():
-            history[name].append(value)
-            logger.log_scalar(name, value, step)
-    return history
+    def fit(self, title: str, losses: Sequence[LossModule], buffer: TensorDictReplayBuffer, rows: int) -> None:
+        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences."""
+        parameters = [p for loss in losses for p in loss.parameters() if p.requires_grad]
+        steps = self.cfg[f"{title}_steps"]
+        optimizer = torch.optim.Adam(parameters)
+        rate = self.cfg.learning_rate
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps, pct_start=0.1)
+        history: dict[str, list[float]] = defaultdict(list)
+        bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
+        for step in bar:
+            batch = buffer.sample().reshape(rows, -1).to(self.cfg.device)
+            outputs = [loss(batch) for loss in losses]
+            sum(value for output in outputs for name, value in output.items() if name.startswith("loss_")).backward()
+            torch.nn.utils.clip_grad_norm_(parameters, self.cfg.max_grad_norm)
+            optimizer.step()
+            optimizer.zero_grad()
+            schedule.step()
+            measured = {name: float(value.detach()) for output in outputs for name, value in output.items()}
+            bar.set_postfix({name.removeprefix("loss_"): f"{value:.3f}" for name, value in measured.items()})
+            for name, value in measured.items():
+                history[name].append(value)
+                self.logger.log_scalar(name, value, step)
+        self.history |= history
+
+    def view(self, sampler: Sampler, frames: int, length: int, once: bool = False, **disturbed: float):
+        """A buffer over the demonstrations that draws their images, seen from disturbed poses, when sampled."""
+        cfg = self.cfg
+        camera = make_camera(self.town, modality=cfg.modality, appearance=cfg.appearance, seed=cfg.seed)
+        moved: Transform = DisturbedView(self.town, length, seed=cfg.seed, **disturbed)
+        drawn = OncePerFrame(camera.to(cfg.device)) if once else camera.to(cfg.device)
+        return TensorDictReplayBuffer(
+            storage=self.demonstrations.storage,
+            sampler=sampler,
+            batch_size=frames,
+            transform=Compose(moved, DeviceCastTransform(cfg.device), drawn),
+        )
+
+    def language(self) -> None:
+        """Learn to read: what sentences mean. The words' encoder then stays as it is."""
+        cfg = self.cfg
+        sentences = collect_sentences(cfg.sentences, cfg.batch_sentences, seed=cfg.seed)
+        self.fit("language", [KeywordLoss(self.policy)], sentences, cfg.batch_sentences)
+
+    def low_level(self) -> None:
+        """Learn to steer and give gas, and to see where a sub-task ends."""
+        cfg = self.cfg
+        sampler = SnippetSampler(self.demonstrations, cfg.slice_length, seed=cfg.seed)
+        slices = self.view(sampler, cfg.batch_slices * cfg.slice_length, cfg.slice_length)
+        losses = [ControlLoss(self.agent.control), EndOfSubtaskLoss(self.agent.end_of_subtask)]
+        self.fit("low_level", losses, slices, cfg.batch_slices)
+
+    def high_level(self) -> None:
+        """Learn to decide; a single policy to act on its own."""
+        cfg = self.cfg
+        encoder: nn.Module = self.policy.reader[0]
+        encoder.requires_grad_(False)
+        settings = {"misleading": cfg.misleading, "seed": cfg.seed}
+        if isinstance(self.agent, HierarchicalAgent):
+            sampler = BoundarySampler(self.demonstrations, self.town, **settings)
+            frames = cfg.batch_sequences * sampler.decisions
+            decisions = self.view(sampler, frames, 1, lateral=0.3, yaw=0.1)
+            self.fit("high_level", [SubtaskLoss(self.policy)], decisions, cfg.batch_sequences)
+        else:
+            sampler = DriveSampler(self.demonstrations, self.town, cfg.drive_length, **settings)
+            drives = self.view(sampler, cfg.batch_drives * cfg.drive_length, cfg.drive_length, once=True)
+            self.fit("drives", [SinglePolicyLoss(self.policy)], drives, cfg.batch_drives)
+        encoder.requires_grad_(True)
 
 
-def view(cfg: DictConfig, storage: Storage, sampler: Sampler, batch_size: int, disturbed: DisturbedView, town: Town):
-    """A buffer over the demonstrations that draws their images, seen from disturbed poses, when sampled."""
-    camera = DashCamera(town, modality=cfg.modality, appearance=cfg.appearance, seed=cfg.seed)
-    return TensorDictReplayBuffer(
-        storage=storage,
-        sampler=sampler,
-        batch_size=batch_size,
-        transform=Compose(disturbed, DeviceCastTransform(cfg.device), camera.to(cfg.device)),
-    )
+def start_from(agent: Agent, checkpoint: str) -> list[str]:
+    """Copy the parts of a trained agent that fit: same name, same tensors.
 
-
-def train(cfg: DictConfig, agent: HierarchicalAgent, folder: Path) -> History:
-    """Collect demonstrations and train the three networks."""
-    town = Town.load(cfg.town)
-    shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
-    logger = CSVLogger("log", str(folder))
-    demonstrations = collect_demonstrations(
-        town, cfg.demonstration_frames, path=folder / "demonstrations", seed=cfg.seed
-    )
-    slices = view(
-        cfg,
-        demonstrations.storage,
-        SnippetSampler(demonstrations, cfg.slice_length, seed=cfg.seed),
-        cfg.batch_slices * cfg.slice_length,
-        DisturbedView(town, cfg.slice_length, seed=cfg.seed),
-        town,
-    )
-    losses = [ControlLoss(agent.control), EndOfSubtaskLoss(agent.end_of_subtask)]
-    history = fit(cfg, "low_level", losses, slices, cfg.batch_slices, logger)
-    sampler = BoundarySampler(demonstrations, town, seed=cfg.seed)
-    decisions = view(
-        cfg,
-        demonstrations.storage,
-        sampler,
-        cfg.batch_sequences * sampler.decisions,
-        DisturbedView(town, 1, lateral=0.3, yaw=0.1, seed=cfg.seed),
-        town,
-    )
-    return history | fit(cfg, "high_level", [SubtaskLoss(agent.high_level)], decisions, cfg.batch_sequences, logger)
+    Returns:
+        Their names.
+    """
+    theirs, copied = dict(load_agent(checkpoint).named_modules()), []
+    for name, module in agent.named_modules():
+        inside = any(name.startswith(f"{part}.") for part in copied)
+        fits = name and type(theirs.get(name)) is type(module) and len(module.state_dict()) and not inside
+        if not fits:
+            continue
+        weights = theirs[name].state_dict()
+        if {k: v.shape for k, v in weights.items()} == {k: v.shape for k, v in module.state_dict().items()}:
+            module.load_state_dict(weights)
+            copied.append(name)
+    return copied
 
 
 def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
-    """The built-in episodes of both towns, all or the first few of each keyword."""
+    """The built-in episodes of both towns, misleading ones if trained for, all or the first few of each keyword."""
     episodes, seen = [], defaultdict(int)
     for town in towns.values():
-        for episode in builtin_episodes(town):
+        for episode in misleading_episodes(town) if cfg.misleading else builtin_episodes(town):
             seen[town.name, episode.keyword] += 1
             if cfg.episodes_per_keyword is None or seen[town.name, episode.keyword] <= cfg.episodes_per_keyword:
                 episodes.append(episode)
     return episodes
-
-
-@hydra.main(config_path="config", config_name="bc_hierarchical", version_base="1.3")
-def main(cfg: DictConfig) -> None:
-    """Run all stages."""
-    folder = Path("runs") / str(cfg.name)
-    torch.manual_seed(cfg.seed)
-    try:
-        towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
-        agent = HierarchicalAgent(AgentConfig(modality=cfg.modality, **OmegaConf.to_container(cfg.model))).to(cfg.device)
-        folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, folder / "config.yaml")
-    except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
-        sys.exit(f"error: {error}")
-    began = time.perf_counter()
-
-    history = train(cfg, agent, folder)
-    save_agent(agent, folder)
-    plot_losses({name: losses for name, losses in history.items() if name.startswith("loss_")}, folder / "losses.png")
-    trained = time.perf_counter()
-
-    episodes = choose_episodes(cfg, towns)
-    with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
-        outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
-    write_json(outcomes, folder / "report.json")
-    for town in towns.values():
-        plot_tracks(outcomes, town, folder / f"tracks_{town.name}.png")
-    details = {
-        "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations, {cfg.low_level_steps:,} low-level and "
-        f"{cfg.high_level_steps:,} high-level batches",
-        "Seed": str(cfg.seed),
-        "Training": f"{trained - began:.0f} s",
-        "Evaluation": f"{time.perf_counter() - trained:.0f} s",
-        "Hardware": f"{platform.machine()}, {torch.get_num_threads()} threads, device {cfg.device}",
-        "Versions": f"Python {platform.python_version()}, torch {torch.__version__}",
-    }
-    report = to_markdown(outcomes, title=folder.name, details=details)
-    with replacing(folder / "report.md") as file:
-        file.write_text(report, encoding="utf-8")
-    print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{next(iter(towns))}.png.")
-
-
-if __name__ == "__main__":
-    main()

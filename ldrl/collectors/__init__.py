@@ -5,6 +5,7 @@ from ldrl.collectors.drives import DriveSampler, OncePerFrame
 from ldrl.collectors.evaluation import Outcome, evaluate
 from ldrl.collectors.expert import Expert, expert_action
 from ldrl.collectors.segments import BoundarySampler, Segment, find_misleading, find_segments
+from ldrl.collectors.sentences import collect_sentences
 from ldrl.collectors.snippets import DisturbedView, Snippets, SnippetSampler, cut_snippets
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "Snippets",
     "SteeringNoise",
     "collect_demonstrations",
+    "collect_sentences",
     "cut_snippets",
     "evaluate",
     "expert_action",

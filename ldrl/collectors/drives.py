@@ -13,7 +13,7 @@ from torchrl.envs import Compose, Transform
 
 from ldrl import keys
 from ldrl.collectors.segments import BoundarySampler
-from ldrl.language import KEYWORDS, disturb
+from ldrl.language import KEYWORDS
 from ldrl.towns import Town
 
 __all__ = ["DriveSampler", "OncePerFrame"]
@@ -26,7 +26,7 @@ class DriveSampler(BoundarySampler):
     """Draws drives from where an instruction is given to behind the last manoeuvre, as many of each keyword.
 
     The batch size of the buffer counts frames, padding included. Each gets the instruction's tokens and ``mask``, False
-    for padding, which repeats the last frame. Sentences are drawn and disturbed as by :class:`BoundarySampler`.
+    for padding, which repeats the last frame. Sentences are drawn as by :class:`BoundarySampler`.
 
     Args:
         buffer: demonstrations.
@@ -61,10 +61,7 @@ class DriveSampler(BoundarySampler):
             behind = segment.snippets[-1]
             first.append(self._decisions(segment)[0][0])
             last.append(min(int(self._snippets.start[behind]) + BEHIND, int(self._snippets.drive_end[behind]) - 1))
-            sentence = self._sentences.sample(keyword, self._random)
-            if self._random.random() < self.disturbed:
-                sentence = disturb(sentence, self._words, self._random)
-            sentences.append(sentence)
+            sentences.append(self._passenger.say(keyword, self._random))
         steps = torch.arange(self.length)
         frames = torch.tensor(first).unsqueeze(-1) + steps
         end = torch.tensor(last).unsqueeze(-1)

@@ -15,17 +15,7 @@ from torchrl.data.replay_buffers import Storage
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.snippets import DemonstrationSampler, Snippets, cut_snippets
-from ldrl.language import (
-    KEYWORDS,
-    MEANINGFUL,
-    SAFE_KEYWORDS,
-    Keyword,
-    Sentences,
-    Split,
-    Tokenizer,
-    disturb,
-    realised_by,
-)
+from ldrl.language import KEYWORDS, SAFE_KEYWORDS, Keyword, Passenger, Tokenizer, realised_by
 from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
@@ -42,10 +32,8 @@ BOUNDARY = (-4, 8)
 STOP_IN_SIGHT = 18
 """An instruction given at most so many frames before the first manoeuvre, 16 m before its junction, that asks for an
 impossible straight is answered by stopping at once: if the car waits for the manoeuvre it can only stop behind it."""
-FREQUENT = 20_000
-"""How many of the most frequent words disturb a sentence or make up nonsense."""
 NONSENSE = 0.03
-"""Share of instructions that nobody understands, known and unknown words at random: the safe answer is to stop."""
+"""Share of instructions that ask for nothing or that nobody understands: the safe answer is to stop."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +135,6 @@ class BoundarySampler(DemonstrationSampler):
         town: where they were driven.
         tokenizer: writes the instructions.
         max_junctions: see :func:`find_segments`.
-        split: which sentences are said.
-        disturbed: share of them that is disturbed, see :func:`~ldrl.language.disturb`.
         misleading: share of the instructions that ask for what the map does not allow, singles and doubles; answered
             safely, see :data:`~ldrl.language.SAFE_KEYWORDS`.
         seed: of the sampler's own generator.
@@ -164,8 +150,6 @@ class BoundarySampler(DemonstrationSampler):
         tokenizer: Tokenizer | None = None,
         *,
         max_junctions: int = 3,
-        split: Split = "train",
-        disturbed: float = 0.7,
         misleading: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -183,12 +167,8 @@ class BoundarySampler(DemonstrationSampler):
             raise ValueError(f"no drive in {len(stored)} frames is misled by {', '.join(lacking)}; collect more")
         self.decisions = 2 * max_junctions + 1
         self._tokenizer = Tokenizer() if tokenizer is None else tokenizer
-        self._sentences = Sentences(split)
-        self.disturbed = disturbed
+        self._passenger = Passenger(self._tokenizer.glove, self._tokenizer.max_tokens)
         self.misleading = misleading
-        # GloVe's rows are sorted by frequency: what people say is among the first.
-        frequent = list(self._tokenizer.glove.words)[:FREQUENT]
-        self._words = [word for word in frequent if word.isalpha() and word not in MEANINGFUL]
         self._random = random.Random(seed)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[Any, Tensor]]:
@@ -207,14 +187,10 @@ class BoundarySampler(DemonstrationSampler):
         for _ in range(batch_size // self.decisions):
             keyword, segment = self._segment()
             sequence = self._decisions(segment)
-            sentence = self._sentences.sample(keyword, self._random)
-            if self._random.random() < self.disturbed:
-                sentence = disturb(sentence, self._words, self._random)
+            sentence = self._passenger.say(keyword, self._random)
             if self._random.random() < NONSENSE:
                 sequence = [(sequence[0][0], SubTask.FINISH)]
-                unknown = self._random.random()
-                words = self._random.choices(self._words, k=self._random.randint(1, 12))
-                sentence = " ".join("zzyzzyx" if self._random.random() < unknown else word for word in words)
+                sentence = self._passenger.nonsense(self._random)
             padding = self.decisions - len(sequence)
             frames.append([frame for frame, _ in sequence] + [sequence[-1][0]] * padding)
             chosen = [int(target) for _, target in sequence]

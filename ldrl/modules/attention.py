@@ -9,7 +9,9 @@ __all__ = ["Concatenation", "GatedAttention", "LastWord", "LuongAttention"]
 
 
 class LuongAttention(nn.Module):
-    """Luong et al. (2015), general score: ``linear(encoder state) . decoder state``.
+    """Luong et al. (2015), general score: ``linear(encoder state) . decoder state``, and what a word counts by itself.
+
+    The latter is for the first decision, when the decoder's state is zero: without it all words would count the same.
 
     Args:
         encoder: size of an encoder state.
@@ -19,6 +21,7 @@ class LuongAttention(nn.Module):
     def __init__(self, encoder: int, decoder: int) -> None:
         super().__init__()
         self.score = nn.Linear(encoder, decoder, bias=False)
+        self.relevance = nn.Linear(encoder, 1)
 
     def forward(self, states: Tensor, is_word: Tensor, decoder: Tensor) -> Tensor:
         """Attend to words.
@@ -32,7 +35,7 @@ class LuongAttention(nn.Module):
             ``[*B, E]`` float32, the weighted mean of the states; zero where there is no word.
         """
         # The same as score(states) @ decoder, but one product per row instead of one per word.
-        query = decoder @ self.score.weight
+        query = decoder @ self.score.weight + self.relevance.weight
         score = (states @ query.unsqueeze(-1)).squeeze(-1)
         # A large finite number, so that a row without words has weights and no NaN.
         weights = score.masked_fill(~is_word, -1e9).softmax(-1) * is_word
@@ -65,21 +68,23 @@ class GatedAttention(nn.Module):
 
 
 class LastWord(nn.Module):
-    """The instruction encoder's last state: what a model without attention knows of the sentence."""
+    """The instruction encoder's last states: what a model without attention knows of the sentence."""
 
     def forward(self, states: Tensor, is_word: Tensor) -> Tensor:
-        """Pick a state.
+        """Pick the states.
 
         Args:
             states: encoder states, ``[*B, L, E]`` float32.
             is_word: ``[*B, L]`` bool; True first.
 
         Returns:
-            ``[*B, E]`` float32, the state behind the last word; zero where there is no word.
+            ``[*B, E]`` float32, the state of the forward direction behind the last word and that of the backward
+            direction before the first; zero where there is no word.
         """
         length = is_word.sum(-1, keepdim=True)
-        last = states.take_along_dim((length - 1).clamp(min=0).unsqueeze(-1), -2).squeeze(-2)
-        return last * (length > 0)
+        forward, backward = states.chunk(2, -1)
+        last = forward.take_along_dim((length - 1).clamp(min=0).unsqueeze(-1), -2).squeeze(-2)
+        return torch.cat((last, backward[..., 0, :]), -1) * (length > 0)
 
 
 class Concatenation(nn.Module):

@@ -53,12 +53,12 @@ class AgentConfig:
         conv_channels: of each image encoder's convolutions.
         features: size of each linear layer behind an image encoder.
         low_level_hidden: size of a low-level GRU; there are four in each of the two networks, in ``hihg`` one.
-        instruction_hidden: size of the instruction's GRU.
+        instruction_hidden: size of the instruction's vectors, an even number.
         subtask_embedding: size of a sub-task's embedding, or of the previous action's.
         high_level_hidden: size of the high-level GRU, or of the single policy's.
 
     Raises:
-        ValueError: a size is no whole number above 0, or the model or the modality is unknown.
+        ValueError: a size is no whole number above 0, ``instruction_hidden`` is odd, or the model or the modality is unknown.
     """
 
     model: str = "hih"
@@ -67,7 +67,7 @@ class AgentConfig:
     conv_channels: tuple[int, int, int] = (16, 32, 64)
     features: int = 128
     low_level_hidden: int = 64
-    instruction_hidden: int = 64
+    instruction_hidden: int = 128
     subtask_embedding: int = 16
     high_level_hidden: int = 128
 
@@ -82,6 +82,8 @@ class AgentConfig:
         for name, value in (*sizes.items(), *(("conv_channels", value) for value in convolutions)):
             if type(value) is not int or value < 1:
                 raise ValueError(f"{name} is {value!r}; give a whole number above 0")
+        if self.instruction_hidden % 2:
+            raise ValueError(f"instruction_hidden is {self.instruction_hidden}; give an even number, half for each way")
         object.__setattr__(self, "conv_channels", tuple(convolutions))
 
     @classmethod

@@ -67,13 +67,13 @@ class ImageEncoder(nn.Module):
 
 
 class InstructionEncoder(nn.Module):
-    """Frozen GloVe vectors through a single-layer GRU.
+    """Frozen GloVe vectors through a single-layer GRU that reads both ways.
 
     In training the vectors are disturbed, so that words with like vectors come to count alike and a sentence is
     understood that was never trained on.
 
     Args:
-        hidden: size of the GRU's state.
+        hidden: size of a word's state, half of it of the GRU that reads backwards; an even number.
         noise: standard deviation of Gaussian noise on the vectors in training.
         dropout: share of their components that is dropped in training.
 
@@ -88,7 +88,7 @@ class InstructionEncoder(nn.Module):
         self.embedding = WordEmbedding()
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
-        self.gru = nn.GRU(50, hidden, batch_first=True)
+        self.gru = nn.GRU(50, hidden // 2, batch_first=True, bidirectional=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Encode instructions.

@@ -83,11 +83,11 @@ class InstructedPolicy(TensorDictSequential):
         self, config: AgentConfig, out_key: NestedKey, outputs: int, previous_key: NestedKey, embedding: nn.Module
     ) -> None:
         parts, said_size = config.parts, config.instruction_hidden
+        self.said_size = said_size
         self.hidden = config.high_level_hidden
         self.out_key = out_key
-        words, is_word, said, image, fused = (
-            (keys.AGENT, part) for part in ("words", "is_word", "said", "image", "fused")
-        )
+        words, is_word, image, fused = ((keys.AGENT, part) for part in ("words", "is_word", "image", "fused"))
+        said = keys.SAID
         chain = [TensorDictModule(InstructionEncoder(said_size), [keys.INSTRUCTION_TOKENS], [words, is_word])]
         if parts.attention:
             attention = LuongAttention(said_size, self.hidden)
@@ -111,6 +111,11 @@ class InstructedPolicy(TensorDictSequential):
             )
         )
         super().__init__(*chain, selected_out_keys=[out_key, ("next", *keys.HIGH_LEVEL_STATE)])
+
+    @property
+    def reader(self) -> TensorDictSequential:
+        """The part that turns the instruction into one vector, ``("agent", "said")``: the first two modules."""
+        return TensorDictSequential(*self.module[:2])
 
 
 class HighLevelPolicy(InstructedPolicy):

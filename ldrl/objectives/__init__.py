@@ -1,5 +1,5 @@
 """Losses."""
 
-from ldrl.objectives.imitation import ControlLoss, EndOfSubtaskLoss, SinglePolicyLoss, SubtaskLoss
+from ldrl.objectives.imitation import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 
-__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SinglePolicyLoss", "SubtaskLoss"]
+__all__ = ["ControlLoss", "EndOfSubtaskLoss", "KeywordLoss", "SinglePolicyLoss", "SubtaskLoss"]

@@ -1,4 +1,4 @@
-"""Imitation losses of the three networks (paper, section 4), and of the single policies."""
+"""Imitation losses of the three networks (paper, section 4) and of the single policies; and one to learn to read."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from tensordict.utils import NestedKey
+from torch import nn
 from torch.nn import functional
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 
 from ldrl import keys
-from ldrl.modules import HighLevelPolicy, LowLevelPolicy, SinglePolicy, unroll
+from ldrl.language import KEYWORDS
+from ldrl.modules import HighLevelPolicy, InstructedPolicy, LowLevelPolicy, SinglePolicy, unroll
 
-__all__ = ["ControlLoss", "EndOfSubtaskLoss", "SinglePolicyLoss", "SubtaskLoss"]
+__all__ = ["ControlLoss", "EndOfSubtaskLoss", "KeywordLoss", "SinglePolicyLoss", "SubtaskLoss"]
 
 
 class _LowLevelLoss(LossModule):
@@ -106,6 +108,53 @@ class EndOfSubtaskLoss(_LowLevelLoss):
         loss = functional.binary_cross_entropy_with_logits(logit, ended.float())
         accuracy = ((logit > 0) == ended).float().mean()
         return TensorDict({"loss_end_of_subtask": loss, "accuracy_end_of_subtask": accuracy})
+
+
+class KeywordLoss(LossModule):
+    """Cross entropy of the keyword that a sentence means, told from what a policy reads in it.
+
+    Sentences cost much less than images, so many more of them can be learned from before the policy learns to act.
+
+    Args:
+        policy: with a ``reader``, which is trained, with a linear head that is of no use afterwards.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        keyword: NestedKey = keys.KEYWORD
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_keyword"]  # noqa: RUF012
+    reader: TensorDictModuleBase
+    reader_params: TensorDictParams
+    target_reader_params: TensorDictParams
+
+    def __init__(self, policy: InstructedPolicy) -> None:
+        super().__init__()
+        self._in_keys = None
+        self.hidden = policy.hidden
+        self.convert_to_functional(policy.reader, "reader", create_target_params=False)
+        self.head = nn.Linear(policy.said_size, len(KEYWORDS) + 1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss.
+
+        Args:
+            tensordict: sentences, any batch size: instruction tokens and ``keyword``, which is the number of keywords
+                where a sentence asks for nothing.
+
+        Returns:
+            ``loss_keyword``, a scalar, and ``accuracy_keyword``, the share of sentences understood.
+        """
+        inputs = tensordict.select(keys.INSTRUCTION_TOKENS).flatten()
+        inputs[keys.HIGH_LEVEL_STATE] = torch.zeros(len(inputs), self.hidden, device=tensordict.device)
+        with self.reader_params.to_module(self.reader):
+            logits = self.head(self.reader(inputs)[keys.SAID])
+        target = tensordict[self.tensor_keys.keyword].flatten()
+        loss = functional.cross_entropy(logits, target)
+        accuracy = (logits.argmax(-1) == target).float().mean()
+        return TensorDict({"loss_keyword": loss, "accuracy_keyword": accuracy})
 
 
 class SubtaskLoss(LossModule):

@@ -1,0 +1,52 @@
+"""Sentences and what they mean, to train what reads them."""
+
+from __future__ import annotations
+
+import random
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+
+from ldrl import keys
+from ldrl.language import KEYWORDS, Passenger, Tokenizer
+
+__all__ = ["collect_sentences"]
+
+NONSENSE = 0.05
+"""Share of sentences that ask for nothing."""
+
+
+def collect_sentences(
+    count: int, batch_size: int, tokenizer: Tokenizer | None = None, seed: int = 0
+) -> TensorDictReplayBuffer:
+    """What passengers say, as many sentences of each keyword, and some that ask for nothing.
+
+    Args:
+        count: how many sentences.
+        batch_size: of a sample.
+        tokenizer: writes them.
+        seed: of what they say.
+
+    Returns:
+        A buffer of ``instruction_tokens``, ``[48]`` int64, and ``keyword``, ``[]`` int64: its index among
+        :data:`~ldrl.language.KEYWORDS`, or their number where nothing is asked for.
+    """
+    tokenizer = Tokenizer() if tokenizer is None else tokenizer
+    rng, passenger = random.Random(seed), Passenger(tokenizer.glove, tokenizer.max_tokens)
+    sentences, meant = [], []
+    for _ in range(count):
+        keyword = len(KEYWORDS) if rng.random() < NONSENSE else rng.randrange(len(KEYWORDS))
+        meant.append(keyword)
+        known = keyword < len(KEYWORDS)
+        sentences.append(passenger.say(list(KEYWORDS)[keyword], rng) if known else passenger.nonsense(rng))
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(count),
+        sampler=RandomSampler(),
+        batch_size=batch_size,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    buffer.extend(
+        TensorDict({keys.INSTRUCTION_TOKENS: tokenizer(sentences), keys.KEYWORD: torch.tensor(meant)}, [count])
+    )
+    return buffer
