@@ -29,7 +29,7 @@ from tqdm import tqdm
 from ldrl.envs import DashCamera, RoadSegmenter
 from ldrl.envs.appearance import WEATHERS
 from ldrl.envs.camera import shift
-from ldrl.envs.segmenter import PREPROCESSING, ImageFormat
+from ldrl.envs.image_format import PREPROCESSING, ImageFormat
 from ldrl.towns import Town, random_town
 
 BESIDE, TURNED = 0.8, 0.2

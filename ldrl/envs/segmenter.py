@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import torch
+from safetensors import SafetensorError
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, interpolate
@@ -19,91 +18,16 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import Transform
 
 from ldrl import keys
+from ldrl.envs.image_format import PREPROCESSING, ImageFormat
 
 if TYPE_CHECKING:
     from transformers import MobileNetV2ForSemanticSegmentation
 
-__all__ = ["PREPROCESSING", "ImageFormat", "RoadSegmenter"]
+__all__ = ["RoadSegmenter"]
 
 SHIPPED = Path(__file__).parent / "weights"
-PREPROCESSING = "preprocessor_config.json"
-"""The file beside the weights that says in which form images go into the network."""
 FRAMES_AT_ONCE = {"cpu": 32, "cuda": 1024}
 """Frames segmented together: on a processor so few that a layer's output stays in its cache."""
-
-
-@dataclass(frozen=True)
-class ImageFormat:
-    """In which form images go into a network: the part that a ``preprocessor_config.json`` of ``transformers`` tells.
-
-    A centre crop is not made: it would take the sides of the road away, and the network is convolutional.
-
-    Args:
-        size: rows and columns after scaling; None leaves images as they are.
-        shortest: rows or columns after scaling, whichever are fewer, in place of ``size``.
-        mean: of each colour, subtracted from values in [0, 1].
-        std: of each colour, divided by.
-        first_row: the first row of the dash camera's image that the network sees; no road can show above it.
-    """
-
-    size: tuple[int, int] | None = None
-    shortest: int | None = None
-    mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    first_row: int = 0
-
-    @classmethod
-    def read(cls, path: str | Path) -> ImageFormat:
-        """Read a ``preprocessor_config.json``."""
-        told = json.loads(Path(path).read_text(encoding="utf-8"))
-        normal = {} if not told.get("do_normalize", True) else told
-        size = told.get("size", {}) if told.get("do_resize", True) else {}
-        size = {"shortest_edge": size} if isinstance(size, int) else size
-        return cls(
-            size=(size["height"], size["width"]) if "height" in size else None,
-            shortest=size.get("shortest_edge"),
-            mean=tuple(normal.get("image_mean", (0.0,) * 3)),
-            std=tuple(normal.get("image_std", (1.0,) * 3)),
-            first_row=told.get("first_row", 0),
-        )
-
-    def write(self, path: str | Path) -> None:
-        """Write what :meth:`read` reads."""
-        size = {"shortest_edge": self.shortest} if self.shortest else {}
-        told = {
-            "image_processor_type": "MobileNetV2ImageProcessor",
-            "do_resize": bool(self.size or self.shortest),
-            "size": dict(zip(("height", "width"), self.size, strict=True)) if self.size else size,
-            "do_center_crop": False,
-            "do_rescale": True,
-            "rescale_factor": 1 / 255,
-            "do_normalize": True,
-            "image_mean": self.mean,
-            "image_std": self.std,
-            "first_row": self.first_row,
-        }
-        Path(path).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
-
-    def pixels(self, images: Tensor) -> Tensor:
-        """What the network reads.
-
-        Args:
-            images: ``[N, 3, 88, 200]`` uint8.
-
-        Returns:
-            ``[N, 3, rows, columns]`` float32, in the memory format that convolutions are fastest in.
-        """
-        std, mean = images.new_tensor([self.std, self.mean], dtype=torch.float32).unsqueeze(-1).unsqueeze(-1).unbind(0)
-        pixels = images[:, :, self.first_row :].contiguous(memory_format=torch.channels_last)
-        rows, columns = pixels.shape[-2:]
-        scale = self.shortest / min(rows, columns) if self.shortest else 1.0
-        size = self.size or (round(rows * scale), round(columns * scale))
-        if size != (rows, columns):
-            pixels = (
-                pixels if pixels.device.type == "cpu" else pixels.float()
-            )  # only a CPU scales whole numbers: faster
-            pixels = interpolate(pixels, size, mode="bilinear", antialias=True)
-        return pixels.float().mul_(1 / 255 / std).sub_(mean / std)
 
 
 class RoadSegmenter(Transform):
@@ -188,17 +112,16 @@ def _load(name: str | Path) -> tuple[MobileNetV2ForSemanticSegmentation, ImageFo
                 name, local_files_only=local, output_loading_info=True
             )
             image_format = transformers.utils.cached_file(name, PREPROCESSING, local_files_only=local)
-    except OSError as error:
+    except (OSError, RuntimeError, SafetensorError) as error:
         shipped = ", ".join(sorted(path.parent.name for path in SHIPPED.glob(f"*/{PREPROCESSING}")))
         raise ValueError(
             f"no segmenter {str(name)!r} ({error}); give a folder with model.safetensors, config.json and "
             f"{PREPROCESSING}, a model on the Hub, or one of the shipped ones: {shipped}"
         ) from None
-    lacking = found["missing_keys"] or found["mismatched_keys"]
-    if lacking:
+    if found["missing_keys"]:
         raise ValueError(
-            f"the weights of {str(name)!r} are no MobileNetV2ForSemanticSegmentation's: {min(lacking)} is missing or "
-            "of another size"
+            f"the weights of {str(name)!r} are no MobileNetV2ForSemanticSegmentation's: {min(found['missing_keys'])} "
+            "is missing; take weights that were trained for segmentation"
         )
     return network, ImageFormat.read(image_format)
 
@@ -247,7 +170,7 @@ class _Head(nn.Module):
         head: of a ``MobileNetV2ForSemanticSegmentation``, with normalisation folded in.
     """
 
-    def __init__(self, head: nn.Module) -> None:
+    def __init__(self, head: Any) -> None:
         super().__init__()
         self.pool, self.aspp, self.classifier = head.conv_pool, head.conv_aspp, head.classifier
         both = head.conv_projection.convolution

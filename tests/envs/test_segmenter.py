@@ -19,7 +19,7 @@ from ldrl import keys
 from ldrl.envs import DashCamera, RoadSegmenter, TownEnv, make_camera, make_env, make_highway_env, segmenter
 from ldrl.envs.appearance import WEATHERS
 from ldrl.envs.camera import shift
-from ldrl.envs.segmenter import PREPROCESSING, ImageFormat
+from ldrl.envs.image_format import PREPROCESSING, ImageFormat
 
 HUB = {  # as the DeepLabv3+ weights on the Hub have it, but smaller
     "crop_size": {"height": 60, "width": 60},
