@@ -44,7 +44,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installing ldrl and the versions in constraints.txt (torch is the large one; minutes the first time)"
 	@set -o pipefail; start=$$SECONDS; \
 	if [ -t 1 ]; then line='\r\033[K  %s'; end='\r\033[K'; else line='  %s\n'; end=''; fi; \
-	$(RUN) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e ".[dev]" \
+	$(RUN) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e ".[dev,ps]" \
 	| while read -r step what rest; do \
 		case $$step in \
 			Downloading) printf "$$line" "downloading $$what $$rest" ;; \

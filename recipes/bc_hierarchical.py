@@ -162,3 +162,63 @@ def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
             if cfg.episodes_per_keyword is None or seen[town.name, episode.keyword] <= cfg.episodes_per_keyword:
                 episodes.append(episode)
     return episodes
+
+
+def write_report(cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: Path, training: str) -> None:
+    """Evaluate, and write what came of it."""
+    began = time.perf_counter()
+    episodes = choose_episodes(cfg, towns)
+    with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
+        outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
+    details = {
+        "Model": f"{cfg.model}, {cfg.modality}",
+        "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations; "
+        + "; ".join(f"{stage}: {cfg[f'{stage}_steps']:,} batches" for stage in cfg.stages),
+        "Seed": str(cfg.seed),
+        "Training": training,
+        "Evaluation": f"{time.perf_counter() - began:.0f} s",
+        "Hardware": f"{platform.machine()}, {torch.get_num_threads()} threads, device {cfg.device}",
+        "Versions": f"Python {platform.python_version()}, torch {torch.__version__}",
+    }
+    write_json(outcomes, folder / "report.json", details)
+    for town in towns.values():
+        plot_tracks(outcomes, town, folder / f"tracks_{town.name}.png")
+    report = to_markdown(outcomes, title=folder.name, details=details)
+    with replacing(folder / "report.md") as file:
+        file.write_text(report, encoding="utf-8")
+    print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{next(iter(towns))}.png.")
+
+
+@hydra.main(config_path="config", config_name="bc_hierarchical", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Run all stages."""
+    torch.manual_seed(cfg.seed)
+    folder = Path("runs") / str(cfg.name)
+    try:
+        unknown = set(cfg.stages) - set(STAGES)
+        if unknown:
+            raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
+        towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
+        sizes = OmegaConf.to_container(cfg.size)
+        agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
+        if cfg.start_from is not None:
+            copied = start_from(agent, str(cfg.start_from))
+            print(f"Taken from {cfg.start_from}: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(cfg, folder / "config.yaml")
+    except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
+        sys.exit(f"error: {error}")
+
+    began = time.perf_counter()
+    training = Training(cfg, agent, folder)
+    for stage in STAGES:
+        if stage in cfg.stages and not (stage == "low_level" and not isinstance(agent, HierarchicalAgent)):
+            getattr(training, stage)()
+    save_agent(agent, folder)
+    losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}
+    plot_losses(losses, folder / "losses.png")
+    write_report(cfg, agent, towns, folder, f"{time.perf_counter() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

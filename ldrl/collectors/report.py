@@ -86,35 +86,38 @@ def _grouped(outcomes: Sequence[Outcome], labels: Sequence[str], names: Iterable
     return {name: _rates(group) for name, group in groups.items() if group}
 
 
-def to_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def to_json(outcomes: Sequence[Outcome], details: Mapping[str, str] | None = None) -> dict[str, Any]:
     """The whole evaluation as JSON values.
 
     Args:
         outcomes: in the order of the episode file.
+        details: what else to tell by name, see :func:`to_markdown`.
 
     Returns:
-        ``{"summary": summarise(outcomes), "episodes": [record, ...]}``, the records in the outcomes' order.
+        ``{"summary": summarise(outcomes), "details": {...}, "episodes": [record, ...]}``, the records in the outcomes'
+        order.
     """
     records = [outcome.record() for outcome in outcomes]
     for record in records:
         # JSON has no NaN and no infinity, which a broken policy can leave behind.
         record |= {k: None for k, v in record.items() if isinstance(v, float) and not math.isfinite(v)}
-    return {"summary": summarise(outcomes), "episodes": records}
+    return {"summary": summarise(outcomes), "details": dict(details or {}), "episodes": records}
 
 
-def write_json(outcomes: Sequence[Outcome], path: str | Path) -> None:
+def write_json(outcomes: Sequence[Outcome], path: str | Path, details: Mapping[str, str] | None = None) -> None:
     """Write :func:`to_json` to a file, whole or not at all.
 
     Args:
         outcomes: in the order of the episode file.
         path: the file; its folder must exist.
+        details: what else to tell by name.
 
     Raises:
         OSError: the file cannot be written.
     """
     # Escaped to ASCII, so that an id of lone surrogates, which JSON allows and UTF-8 does not, comes back unchanged.
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(to_json(outcomes), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(to_json(outcomes, details), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 @contextmanager

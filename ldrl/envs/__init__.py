@@ -2,11 +2,12 @@
 
 from ldrl.envs.camera import DashCamera
 from ldrl.envs.episodes import Episode, builtin_episodes, load_episodes, save_episodes
-from ldrl.envs.factory import make_env, make_highway_env
+from ldrl.envs.factory import make_camera, make_env, make_highway_env
 from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
 from ldrl.envs.misleading import misleading_episodes
+from ldrl.envs.segmenter import RoadSegmenter
 from ldrl.envs.town import TownEnv
 
 __all__ = [
@@ -14,10 +15,12 @@ __all__ = [
     "Episode",
     "HighwayTownEnv",
     "Instruction",
+    "RoadSegmenter",
     "SubtaskLabels",
     "TownEnv",
     "builtin_episodes",
     "load_episodes",
+    "make_camera",
     "make_env",
     "make_highway_env",
     "misleading_episodes",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, EnvBase, GymWrapper, InitTracker, TransformedEnv
+from torchrl.envs import Compose, EnvBase, GymWrapper, InitTracker, Transform, TransformedEnv
 
 from ldrl import keys
 from ldrl.envs.camera import DashCamera, Modality
@@ -15,10 +15,32 @@ from ldrl.envs.episodes import Episode
 from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
+from ldrl.envs.segmenter import RoadSegmenter
 from ldrl.envs.town import TownEnv
 from ldrl.towns import Town
 
-__all__ = ["make_env", "make_highway_env"]
+__all__ = ["make_camera", "make_env", "make_highway_env"]
+
+
+def make_camera(town: Town, modality: Modality = "gs", *, appearance: str | int = "clear", seed: int = 0) -> Transform:
+    """What draws the images of a modality, in an env or in a replay buffer.
+
+    Args:
+        town: what there is to see.
+        modality: ``"gs"``, the road; ``"rgb"``; or ``"ps"``, the road that the shipped
+            :class:`~ldrl.envs.RoadSegmenter` sees in the rgb images.
+        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
+        seed: of the appearances.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> poses = TensorDict({("world", "pose"): torch.zeros(5, 3)}, [5])
+        >>> make_camera(Town.load("town1"), "ps")(poses)["observation", "image"].shape
+        torch.Size([5, 1, 88, 200])
+    """
+    if modality == "ps":
+        return Compose(DashCamera(town, modality="rgb", appearance=appearance, seed=seed), RoadSegmenter())
+    return DashCamera(town, modality=modality, appearance=appearance, seed=seed)
 
 
 def make_env(
@@ -41,8 +63,8 @@ def make_env(
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: one per row, with their instructions; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
-        modality: of the images, ``"gs"`` or ``"rgb"``.
-        appearance: of rgb images, see :class:`~ldrl.envs.DashCamera`.
+        modality: of the images, see :func:`make_camera`.
+        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
         max_steps: length of a roaming episode.
         traffic: other cars in each world.
         device: where the tensors are.
@@ -73,8 +95,8 @@ def make_highway_env(
         town: a town, the name of one or the path of an OpenDRIVE map.
         episode: with its instruction; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
-        modality: of the images, ``"gs"`` or ``"rgb"``.
-        appearance: of rgb images, see :class:`~ldrl.envs.DashCamera`.
+        modality: of the images, see :func:`make_camera`.
+        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
         config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
         seed: of the env, the instructions and the appearances.
 
@@ -100,8 +122,7 @@ def _stack(
     said = None if episodes is None else [episode.instruction for episode in episodes]
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
-        camera = DashCamera(town, modality=modality, appearance=appearance, seed=seed)
-        transforms.append(camera.to(env.device))
+        transforms.append(make_camera(town, modality, appearance=appearance, seed=seed).to(env.device))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms += [InitTracker(), policy.make_tensordict_primer()]
     return TransformedEnv(env, Compose(*transforms))

@@ -16,8 +16,15 @@ KERNELS = ((8, 4), (4, 2), (4, 2))
 """Kernel size and stride of each convolution (paper's implementation); 88x200 becomes 3x10, 48x200 becomes 1x10."""
 
 
+BUMPER = (slice(-10, None), slice(60, 140))
+"""Rows and columns of the image that show the road in front of the car, 2.5 to 4 m ahead."""
+
+
 class ImageEncoder(nn.Module):
     """Three convolutions with ELU.
+
+    Colours are taken relative to the mean colour of the road in front of the car, so that neither the light nor the
+    asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look from that patch).
 
     Args:
         in_channels: channels of the image.
@@ -62,6 +69,8 @@ class ImageEncoder(nn.Module):
         """
         image = image[..., -self.rows :, :]
         flat = image.reshape(-1, *image.shape[-3:]).to(self.layers[0].weight.dtype).div_(255)
+        if flat.shape[1] > 1:  # the road itself is known by one channel
+            flat = (flat - flat[..., *BUMPER].mean((-2, -1), keepdim=True)).mul_(4)
         features = self.layers(flat.contiguous(memory_format=torch.channels_last))
         return features.reshape(*image.shape[:-3], *features.shape[1:])
 

@@ -1,0 +1,209 @@
+"""Train the road segmenter on random towns in random looks, and measure it on Town 1 and Town 2, which it never saw.
+
+    python recipes/train_segmenter.py
+    python recipes/train_segmenter.py network.depth_multiplier=0.5 name=wide
+    python recipes/train_segmenter.py steps=2 towns=1 frames=8 name=smoke    # everything once, to see it run
+
+Results go to runs/<name>/: the weights, which RoadSegmenter("runs/<name>") loads, report.md, report.json and
+views.png. It needs transformers: pip install "ldrl[ps]".
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import time
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import hydra
+import torch
+from matplotlib.image import imsave
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
+from tqdm import tqdm
+
+from ldrl.envs import DashCamera, RoadSegmenter
+from ldrl.envs.appearance import WEATHERS
+from ldrl.envs.camera import shift
+from ldrl.envs.image_format import PREPROCESSING, ImageFormat
+from ldrl.towns import Town, random_town
+
+BESIDE, TURNED = 0.8, 0.2
+"""Standard deviations of the views from a lane's centre (m) and direction (rad), cut at three of them."""
+CARS, NEAREST, FARTHEST = 4, 6.0, 40.0
+"""Other cars, and how far from the camera they are, m."""
+EVALUATED = ("town1", "town2")
+LOOKS = (*WEATHERS, "sample", "sample, cars")
+"""The town's own materials in each weather, drawn materials and weather, and these with cars in every view."""
+
+
+class View(NamedTuple):
+    """What is seen from one pose each.
+
+    Attributes:
+        images: ``[N, 3, 88, 200]`` uint8.
+        road: ``[N, 1, 88, 200]`` bool.
+    """
+
+    images: Tensor
+    road: Tensor
+
+
+class Views:
+    """Draws what is seen of a town from poses beside its lanes and in its junctions.
+
+    Args:
+        town: what there is to see.
+        appearance: of all views, see :class:`~ldrl.envs.DashCamera`.
+        crowded: share of the views with other cars.
+        seed: of poses, cars and looks.
+        device: where to draw.
+    """
+
+    def __init__(self, town: Town, appearance: str, crowded: float, seed: int, device: str) -> None:
+        self.town, self.crowded, self.device = town, crowded, device
+        self.rgb = DashCamera(town, modality="rgb", appearance=appearance, seed=seed).to(device)
+        self.gs = DashCamera(town).to(device)
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def draw(self, count: int) -> View:
+        """Draw ``count`` views."""
+        pose = self._lane_poses(torch.randint(len(self.town.points), (count,), generator=self._generator))
+        beside, turned = torch.randn(2, count, generator=self._generator).clamp(-3, 3)
+        pose = shift(pose, BESIDE * beside, TURNED * turned)
+        pose, cars = pose.to(self.device), self._cars(pose).to(self.device)
+        return View(self.rgb.draw(pose, cars), self.gs.draw(pose, cars) > 0)
+
+    def _cars(self, pose: Tensor) -> Tensor:
+        """Cars on lanes near each pose, ``[N, 4, 4]``, or NaN where there are none."""
+        distance = torch.cdist(pose[:, :2], self.town.points.cpu())
+        near = ((distance > NEAREST) & (distance < FARTHEST)).float()
+        cars = self._lane_poses(torch.multinomial(near, CARS, generator=self._generator))
+        none = torch.rand(len(pose), generator=self._generator) >= self.crowded
+        return nn.functional.pad(cars, (0, 1)).masked_fill(none.view(-1, 1, 1), torch.nan)
+
+    def _lane_poses(self, point: Tensor) -> Tensor:
+        return torch.cat((self.town.points.cpu()[point], self.town.headings.cpu()[point].unsqueeze(-1)), -1)
+
+
+def fit(cfg: DictConfig, network: nn.Module, image_format: ImageFormat, views: list[Views]) -> None:
+    """Minimise the cross entropy of the logits, scaled up to the image, over ``cfg.steps`` batches."""
+    optimizer = torch.optim.Adam(network.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, cfg.learning_rate, total_steps=cfg.steps, pct_start=0.15)
+    for norm in network.modules():
+        if isinstance(norm, nn.BatchNorm2d):
+            norm.momentum = 0.05  # the configured 0.997 is TensorFlow's: it would keep the last batch's statistics only
+    network.train().to(memory_format=torch.channels_last)
+
+    def update(view: View) -> float:
+        road = view.road[:, :, image_format.first_row :].float()
+        logits = network(image_format.pixels(view.images)).logits
+        # The softmax over two classes depends on the difference of their logits only.
+        margin = interpolate(logits[:, 1:] - logits[:, :1], road.shape[-2:], mode="bilinear")
+        loss = binary_cross_entropy_with_logits(margin, road)
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), cfg.max_grad_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+        schedule.step()
+        return loss.item()
+
+    bar = tqdm(range(cfg.steps), desc="segmenter", unit="batch")
+    for step in bar:
+        bar.set_postfix(loss=f"{update(views[step % len(views)].draw(cfg.batch)):.3f}")
+
+
+def measure(cfg: DictConfig, segmenter: RoadSegmenter, towns: list[Town]) -> tuple[list[dict], list[View]]:
+    """Intersection over union of the road in each town and look, and the views."""
+    rows, seen = [], []
+    for town, look in product(towns, LOOKS):
+        appearance, _, cars = look.partition(", ")
+        view = Views(town, appearance, float(bool(cars)), cfg.seed + 1, cfg.device).draw(cfg.frames)
+        found = segmenter.segment(view.images) > 0
+        both, either = ((mask.flatten(1).sum(1)) for mask in (found & view.road, found | view.road))
+        each = both / either.clamp(min=1)
+        rows.append(
+            {
+                "town": town.name,
+                "look": look,
+                "iou": round(float(both.sum() / either.sum()), 4),
+                "worst_view": round(float(each[either > 0].min()), 4),
+            }
+        )
+        seen.append(view)
+    return rows, seen
+
+
+def table(rows: list[dict]) -> str:
+    """A Markdown table: a row per look, the towns side by side."""
+    towns = list(dict.fromkeys(row["town"] for row in rows))
+    found = {(row["town"], row["look"]): row for row in rows}
+    lines = [
+        f"| look | {' | '.join(f'{town} IoU | {town} worst view' for town in towns)} |",
+        "| --- |" + " ---: |" * 2 * len(towns),
+    ]
+    for look in dict.fromkeys(row["look"] for row in rows):
+        figures = (f"{found[town, look][key]:.3f}" for town in towns for key in ("iou", "worst_view"))
+        lines.append(f"| {look} | {' | '.join(figures)} |")
+    return "\n".join(lines)
+
+
+def plot_views(segmenter: RoadSegmenter, views: list[View], path: Path) -> None:
+    """A line for each town and look, two views in each: what is seen, the road, the road found, where they differ."""
+    lines = []
+    for images, road in ((view.images[:2], view.road[:2]) for view in views):
+        found = segmenter.segment(images) > 0
+        wrong = torch.cat((road & ~found, found & ~road, torch.zeros_like(road)), 1)  # red is missed, green made up
+        parts = [images, *(mask.expand_as(images).to(torch.uint8) * 255 for mask in (road, found, wrong))]
+        lines.append(torch.stack(parts, 1).permute(3, 0, 1, 4, 2).flatten(1, 3))
+    imsave(path, torch.cat(lines).cpu().numpy())
+
+
+@hydra.main(config_path="config", config_name="train_segmenter", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Run all stages."""
+    folder = Path("runs") / str(cfg.name)
+    torch.manual_seed(cfg.seed)
+    try:
+        from transformers import MobileNetV2Config, MobileNetV2ForSemanticSegmentation
+
+        settings = OmegaConf.to_container(cfg.network) | {"id2label": {0: "background", 1: "road"}}
+        network = MobileNetV2ForSemanticSegmentation(MobileNetV2Config(**settings)).to(cfg.device)
+        folder.mkdir(parents=True, exist_ok=True)
+    except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
+        sys.exit(f"error: {error}")
+    began = time.perf_counter()
+    image_format = ImageFormat(size=tuple(cfg.size), first_row=cfg.first_row)
+    towns = (random_town(cfg.first_town + k) for k in range(cfg.towns))
+    views = [
+        Views(town, "sample", 0.5, cfg.seed + k, cfg.device)
+        for k, town in enumerate(tqdm(towns, "towns", cfg.towns, unit="town"))
+    ]
+    fit(cfg, network, image_format, views)
+    network.save_pretrained(folder)
+    image_format.write(folder / PREPROCESSING)
+    trained = time.perf_counter()
+
+    segmenter = RoadSegmenter(folder).to(cfg.device)
+    rows, seen = measure(cfg, segmenter, [Town.load(name) for name in EVALUATED])
+    plot_views(segmenter, seen, folder / "views.png")
+    details = {
+        "training": f"{cfg.steps:,} batches of {cfg.batch} views, {cfg.towns} random towns from {cfg.first_town} on, "
+        f"{trained - began:.0f} s",
+        "evaluation": f"{cfg.frames} views of each town and look",
+        "hardware": f"{platform.machine()}, {torch.get_num_threads()} threads, device {cfg.device}",
+        "versions": f"Python {platform.python_version()}, torch {torch.__version__}",
+    }
+    report = {"details": details, "config": OmegaConf.to_container(cfg), "rows": rows}
+    (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    listed = "\n".join(f"- {name}: {told}" for name, told in details.items())
+    (folder / "report.md").write_text(f"# {folder.name}\n\n{table(rows)}\n\n{listed}\n", encoding="utf-8")
+    print(f"\n{table(rows)}\nEverything is in {folder}/; start with report.md and views.png.")
+
+
+if __name__ == "__main__":
+    main()
