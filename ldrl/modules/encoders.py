@@ -23,7 +23,7 @@ BUMPER = (slice(-10, None), slice(60, 140))
 class ImageEncoder(nn.Module):
     """Three convolutions with ELU.
 
-    Colours are taken relative to the mean colour of the road in front of the car, so that neither the light nor the
+    Colours are taken relative to the mean colour of the road in front of the car and to their spread, so that neither the light nor the
     asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look from that patch).
 
     Args:
@@ -70,7 +70,8 @@ class ImageEncoder(nn.Module):
         image = image[..., -self.rows :, :]
         flat = image.reshape(-1, *image.shape[-3:]).to(self.layers[0].weight.dtype).div_(255)
         if flat.shape[1] > 1:  # the road itself is known by one channel
-            flat = (flat - flat[..., *BUMPER].mean((-2, -1), keepdim=True)).mul_(4)
+            contrast = flat.std((-3, -2, -1), keepdim=True).add_(0.03)
+            flat = (flat - flat[..., *BUMPER].mean((-2, -1), keepdim=True)).div_(contrast)
         features = self.layers(flat.contiguous(memory_format=torch.channels_last))
         return features.reshape(*image.shape[:-3], *features.shape[1:])
 
