@@ -17,7 +17,7 @@ from ldrl.language.sentences import Sentences
 __all__ = ["MEANINGFUL", "Passenger", "training_words"]
 
 MEANINGFUL = frozenset(
-    "left right straight first second next two twice times both another again more double pair couple".split()
+    "left right straight first second next two twice times both another again more couple".split()
 )
 """Words that say which way and how often; nothing random happens to them."""
 FREQUENT = 20_000

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from ldrl.language import PADDING, WordEmbedding
@@ -68,12 +69,21 @@ class ImageEncoder(nn.Module):
             ``[*B, C', H, W]`` float32.
         """
         image = image[..., -self.rows :, :]
-        flat = image.reshape(-1, *image.shape[-3:]).to(self.layers[0].weight.dtype).div_(255)
-        if flat.shape[1] > 1:  # the road itself is known by one channel
-            contrast = flat.std((-3, -2, -1), keepdim=True).add_(0.03)
-            flat = (flat - flat[..., *BUMPER].mean((-2, -1), keepdim=True)).div_(contrast)
-        features = self.layers(flat.contiguous(memory_format=torch.channels_last))
+        flat = image.reshape(-1, *image.shape[-3:]).contiguous(memory_format=torch.channels_last)
+        flat = flat.to(self.layers[0].weight.dtype).div_(255)
+        # The road itself is known by one channel.
+        features = self.layers(flat) if flat.shape[1] == 1 else self.layers[1:](self._relative(flat))
         return features.reshape(*image.shape[:-3], *features.shape[1:])
+
+
+    def _relative(self, image: Tensor) -> Tensor:
+        """What the first convolution makes of ``(image - road) / contrast``, worked out on its fewer pixels."""
+        first = self.layers[0]
+        road = image[..., *BUMPER].mean((-2, -1))
+        contrast = image[..., ::4, ::4].std((-3, -2, -1), keepdim=True) + 0.03
+        absolute = functional.conv2d(image, first.weight, stride=first.stride)
+        offset = road @ first.weight.sum((-2, -1)).T
+        return (absolute - offset[..., None, None]) / contrast + first.bias[:, None, None]
 
 
 class InstructionEncoder(nn.Module):

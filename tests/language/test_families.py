@@ -43,7 +43,11 @@ def filled(parts):
 @pytest.fixture(scope="module")
 def trained():
     parts = [part for file in read("templates").values() for slot in file["slots"].values() for part in slot["train"]]
-    return filled(parts)
+    spoken = yaml.safe_load((resources.files("ldrl.language") / "spoken.yaml").read_text("utf-8"))
+    parts += [body for group in spoken["phrasings"] for body in group["bodies"]]
+    parts += [*spoken["corrections"], *spoken["confirmations"]]
+    talk = {f"{subject} {rest}" for group in spoken["talk"] for subject in group["subject"] for rest in group["rest"]}
+    return filled([*parts, *talk])
 
 
 @pytest.fixture(scope="module")
