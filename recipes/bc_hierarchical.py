@@ -5,7 +5,7 @@
     python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
     python recipes/bc_hierarchical.py preset=rgb               # from colour images
     python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
-    python recipes/bc_hierarchical.py model=h0 start_from=runs/hih stages=[high_level]
+    python recipes/bc_hierarchical.py model=h0 start_from=[runs/hih] stages=[high_level]
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """
@@ -140,7 +140,10 @@ def start_from(agent: Agent, checkpoint: str) -> list[str]:
     Returns:
         Their names.
     """
-    theirs, copied = dict(load_agent(checkpoint).named_modules()), []
+    # A single policy is made of the parts of a high-level policy.
+    own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
+    theirs = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
+    copied: list[str] = []
     for name, module in agent.named_modules():
         inside = any(name.startswith(f"{part}.") for part in copied)
         fits = name and type(theirs.get(name)) is type(module) and len(module.state_dict()) and not inside
@@ -201,9 +204,9 @@ def main(cfg: DictConfig) -> None:
         towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
         sizes = OmegaConf.to_container(cfg.size)
         agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
-        if cfg.start_from is not None:
-            copied = start_from(agent, str(cfg.start_from))
-            print(f"Taken from {cfg.start_from}: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        for checkpoint in cfg.start_from:
+            copied = start_from(agent, str(checkpoint))
+            print(f"Taken from {checkpoint}: {', '.join(copied) or 'nothing, as nothing fits'}.")
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
