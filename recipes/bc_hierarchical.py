@@ -23,7 +23,6 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers import Sampler

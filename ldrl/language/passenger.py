@@ -17,7 +17,22 @@ from ldrl.language.sentences import Sentences
 __all__ = ["MEANINGFUL", "Passenger", "training_words"]
 
 MEANINGFUL = frozenset(
-    "left right straight first second next two twice times both another again more couple".split()
+    [
+        "left",
+        "right",
+        "straight",
+        "first",
+        "second",
+        "next",
+        "two",
+        "twice",
+        "times",
+        "both",
+        "another",
+        "again",
+        "more",
+        "couple",
+    ]
 )
 """Words that say which way and how often; nothing random happens to them."""
 FREQUENT = 20_000
@@ -43,10 +58,10 @@ class Passenger:
         max_words: what a listener hears out; the :class:`~ldrl.language.Tokenizer` keeps so many.
 
     Examples:
-        >>> Passenger().say("left", random.Random(4))
-        'make the left turn'
-        >>> Passenger().nonsense(random.Random(1))
-        'zzyzzyx coca rimet'
+        >>> Passenger().say("left", random.Random(6))
+        'you should take a left turn'
+        >>> Passenger().nonsense(random.Random(3))
+        'let me check the map'
     """
 
     def __init__(self, glove: Glove | None = None, max_words: int = 48) -> None:
@@ -81,8 +96,9 @@ class Passenger:
 
     def nonsense(self, rng: random.Random) -> str:
         """Known and unknown words at random, or talk that asks for nothing: 1 to 12 words."""
-        if rng.random() < 0.3:  # noqa: PLR2004
-            return _talk(rng)
+        talk = _talk(rng)
+        if len(talk.split()) > 2 and rng.random() < 0.3:
+            return talk
         unknown = rng.random()
         words = rng.choices(self._words, k=rng.randint(1, 12))
         return " ".join("zzyzzyx" if rng.random() < unknown else word for word in words)
@@ -110,7 +126,7 @@ class Passenger:
         """Say something wrong first, and take it back: the last word counts."""
         marker = rng.choice(_spoken()["corrections"]).split()
         spots = [k for k, word in enumerate(words) if word in DIRECTIONS or word in ORDINALS]
-        if not spots or rng.random() < 0.3:  # noqa: PLR2004
+        if not spots or rng.random() < 0.3:
             wrong = self._phrase(rng.choice(list(KEYWORDS.values())), rng).split()
             return wrong[: rng.randint(1, len(wrong))] + marker + words
         spot = rng.choice(spots)
@@ -127,7 +143,7 @@ class Passenger:
         """Fill pauses, or stammer."""
         for _ in range(rng.randint(1, 3)):
             spot = rng.randint(0, len(words))
-            stammers = spot < len(words) and words[spot] not in MEANINGFUL and rng.random() < 0.3  # noqa: PLR2004
+            stammers = spot < len(words) and words[spot] not in MEANINGFUL and rng.random() < 0.3
             said = [words[spot]] if stammers else rng.choice(_spoken()["fillers"]).split()
             words = words[:spot] + said + words[spot:]
         return words
@@ -136,7 +152,7 @@ class Passenger:
         """Talk of other things before or after, with direction words in another sense."""
         for _ in range(rng.randint(1, 2)):
             said = _talk(rng).split()
-            words = said + words if rng.random() < 0.6 else words + said  # noqa: PLR2004
+            words = said + words if rng.random() < 0.6 else words + said
         return words
 
     def _slip(self, words: list[str], rng: random.Random) -> list[str]:
@@ -144,18 +160,18 @@ class Passenger:
         words = list(words)
         crucial = [k for k, word in enumerate(words) if word in MEANINGFUL]
         spots = rng.sample(range(len(words)), min(len(words), rng.randint(1, 2)))
-        if crucial and rng.random() < 0.6:  # noqa: PLR2004
+        if crucial and rng.random() < 0.6:
             spots.append(rng.choice(crucial))
         for spot in dict.fromkeys(spots):
             heard = _spoken()["slips"].get(words[spot])
-            words[spot] = rng.choice(heard) if heard and rng.random() < 0.5 else _misspell(words[spot], rng)  # noqa: PLR2004
+            words[spot] = rng.choice(heard) if heard and rng.random() < 0.5 else _misspell(words[spot], rng)
         return words
 
 
 def _misspell(word: str, rng: random.Random) -> str:
     """One edit: a letter dropped, doubled, replaced, or swapped with its neighbour."""
     k = rng.randrange(len(word))
-    if len(word) < 3:  # noqa: PLR2004 (nobody could read it)
+    if len(word) < 3:
         return word
     return rng.choice(
         (
@@ -183,7 +199,10 @@ def _phrasings(name: str) -> list[str]:
     keyword = KEYWORDS[name]
     words = {"dir": keyword.manoeuvres[0].name.lower(), "then": keyword.manoeuvres[-1].name.lower()}
     return [
-        body.format(**words) for group in _spoken()["phrasings"] if name in group["keywords"] for body in group["bodies"]
+        body.format(**words)
+        for group in _spoken()["phrasings"]
+        if name in group["keywords"]
+        for body in group["bodies"]
     ]
 
 

@@ -63,12 +63,13 @@ def _is_symbol(character: str) -> bool:
 def _read_as(word: str) -> tuple[str, ...]:
     """The words of commands that a misspelt or run-together word stands for; none where it resembles nothing."""
     known = training_words()
-    if len(word) >= min(EDITS):
-        near = process.extractOne(word, known, scorer=OSA.distance, score_cutoff=EDITS.get(len(word), 2))
-        if near is not None:
-            return (near[0],)
-    cuts = ((word[:k], word[k:]) for k in range(1, len(word)))
-    return next((parts for parts in cuts if set(parts) <= set(known)), ())
+    for parts in ((word[:k], word[k:]) for k in range(1, len(word))):
+        if all(part in known and (len(part) > 1 or part in "ai") for part in parts):
+            return parts
+    if len(word) < min(EDITS):
+        return ()
+    near = process.extractOne(word, known, scorer=OSA.distance, score_cutoff=EDITS.get(len(word), 2))
+    return () if near is None else (near[0],)
 
 
 class Tokenizer:

@@ -75,7 +75,6 @@ class ImageEncoder(nn.Module):
         features = self.layers(flat) if flat.shape[1] == 1 else self.layers[1:](self._relative(flat))
         return features.reshape(*image.shape[:-3], *features.shape[1:])
 
-
     def _relative(self, image: Tensor) -> Tensor:
         """What the first convolution makes of ``(image - road) / contrast``, worked out on its fewer pixels."""
         first = self.layers[0]

@@ -48,10 +48,30 @@ def test_default_length_and_empty_batch():
 
 def test_unknown_words_are_counted_and_become_one_id():
     tokenizer = Tokenizer(max_tokens=3)
-    tokens = tokenizer(["turn lefft", "\U0001f44d", "lefft lefft"])
+    tokens = tokenizer(["turn zzyzzyx", "\U0001f44d", "zzyzzyx zzyzzyx"])
     assert tokens[0, 1] == UNKNOWN
     assert tokens[1].tolist() == [UNKNOWN, PADDING, PADDING]
-    assert tokenizer.unknown == {"lefft": 3, "\U0001f44d": 1}
+    assert tokenizer.unknown == {"zzyzzyx": 3, "\U0001f44d": 1}
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [
+        ("trun lefft", "turn left"),
+        ("rihgt at the intersektion", "right at the intersection"),
+        ("straigt stright straightt", "straight straight straight"),
+        ("turnleft takea secnd frst", "turn left take a second first"),
+        ("heft", "left"),  # a word, but a rare one
+        ("lift light write strait", "lift light write strait"),  # words that are not rare
+        ("lft", "lft"),  # too short to tell
+        ("zzyzzyx", "zzyzzyx"),
+    ],
+)
+def test_misspelt_and_run_together_words_are_read_as_words_of_commands(written, read):
+    glove = load_glove().words
+    expected = [glove[word] + 2 if word in glove else UNKNOWN for word in read.split()]
+    row = Tokenizer()([written])[0]
+    assert row[row != PADDING].tolist() == expected
 
 
 def test_long_sentences_keep_their_first_words():
