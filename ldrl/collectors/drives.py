@@ -60,7 +60,7 @@ class DriveSampler(BoundarySampler):
             segment = self._random.choice(self._segments[keyword.name])
             behind = segment.snippets[-1]
             first.append(self._decisions(segment)[0][0])
-            last.append(min(int(self._snippets.start[behind]) + BEHIND, int(self._snippets.drive_end[behind]) - 1))
+            last.append(min(int(self._snippets.start[behind]) + BEHIND, int(self._snippets.drive_end[behind])) - 1)
             sentence = self._sentences.sample(keyword, self._random)
             if self._random.random() < self.disturbed:
                 sentence = disturb(sentence, self._words, self._random)
