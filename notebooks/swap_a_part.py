@@ -29,8 +29,8 @@ for k, part in enumerate(agent.high_level.module):
 
 
 # %% [markdown]
-# Part 1 is Luong's attention. In its place, additive attention (Bahdanau et al., 2015): it takes the words' states, which
-# of them are words, and the decoder's state, and gives one vector.
+# Part 1 is Luong's attention. In its place, additive attention (Bahdanau et al., 2015): it takes the words' states,
+# which of them are words, and the decoder's state, and gives one vector.
 
 
 # %%
@@ -62,8 +62,8 @@ rollout = make_env(town, num_cars=2, policy=agent).rollout(5, agent)
 print("sub-tasks", rollout["agent", "subtask"].tolist())
 
 # %% [markdown]
-# And it trains, with the loss, the sampler and the camera of the recipe. A few steps show that it learns; the recipe takes
-# thousands.
+# And it trains, with the loss, the sampler and the camera of the recipe. A few steps show that it learns; the recipe
+# takes thousands.
 
 # %%
 demonstrations = collect_demonstrations(town, 38_400)

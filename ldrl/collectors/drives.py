@@ -60,7 +60,7 @@ class DriveSampler(BoundarySampler):
             segment = self._random.choice(self._segments[keyword.name])
             behind = segment.snippets[-1]
             first.append(self._decisions(segment)[0][0])
-            last.append(min(int(self._snippets.start[behind]) + BEHIND, int(self._snippets.drive_end[behind]) - 1))
+            last.append(min(int(self._snippets.start[behind]) + BEHIND, int(self._snippets.drive_end[behind])) - 1)
             sentences.append(self._passenger.say(keyword, self._random))
         steps = torch.arange(self.length)
         frames = torch.tensor(first).unsqueeze(-1) + steps

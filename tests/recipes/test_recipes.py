@@ -20,7 +20,7 @@ from ldrl.towns import Town
 
 MAP = Path(__file__).parents[1] / "towns" / "theta.xodr"
 RECIPES = Path(__file__).parents[2] / "recipes"
-TINY = ("model.conv_channels=[2,3,4]", "model.features=8", "model.low_level_hidden=6", "model.high_level_hidden=7")
+TINY = ("size.conv_channels=[2,3,4]", "size.features=8", "size.low_level_hidden=6", "size.high_level_hidden=7")
 BRIEF = ("preset=smoke", "low_level_steps=2", "high_level_steps=2", "batch_slices=4", "batch_sequences=4")
 
 
@@ -102,7 +102,7 @@ def test_the_checkpoint_is_the_config(trained):
     cwd, _ = trained
     agent = load_agent(cwd / "runs" / "brief")
     config = yaml.safe_load((cwd / "runs" / "brief" / "config.yaml").read_text())
-    assert agent.config == AgentConfig(**config["model"])
+    assert agent.config == AgentConfig(**config["size"])
     assert agent.config.conv_channels == (2, 3, 4)
     assert config["low_level_steps"] == 2
 
@@ -258,8 +258,8 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
     [
         (["town=atlantis"], "'atlantis'"),
         (["test_town=atlantis"], "'atlantis'"),
-        (["model.features=0"], "features is 0; give a whole number above 0"),
-        (["model.image_rows=10"], "rows is 10"),
+        (["size.features=0"], "features is 0; give a whole number above 0"),
+        (["size.image_rows=10"], "rows is 10"),
         (["device=moon"], "moon"),
     ],
 )
