@@ -31,6 +31,7 @@ from torchrl.objectives import LossModule
 from torchrl.record import CSVLogger
 from tqdm import tqdm
 
+from ldrl import keys
 from ldrl.collectors import (
     BoundarySampler,
     DisturbedView,
@@ -44,7 +45,7 @@ from ldrl.collectors import (
 from ldrl.collectors.plots import plot_losses, plot_tracks
 from ldrl.collectors.report import replacing, table, to_markdown, write_json
 from ldrl.envs import Episode, builtin_episodes, make_camera, misleading_episodes
-from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
+from ldrl.modules import MODELS, Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 from ldrl.towns import Town
 
@@ -88,17 +89,16 @@ class Training:
                 self.logger.log_scalar(name, value, step)
         self.history |= history
 
-    def view(self, sampler: Sampler, frames: int, length: int, once: bool = False, **disturbed: float):
+    def view(self, sampler: Sampler, frames: int, length: int, **disturbed: float) -> TensorDictReplayBuffer:
         """A buffer over the demonstrations that draws their images, seen from disturbed poses, when sampled."""
         cfg = self.cfg
-        camera = make_camera(self.town, modality=cfg.modality, appearance=cfg.appearance, seed=cfg.seed)
-        moved: Transform = DisturbedView(self.town, length, seed=cfg.seed, **disturbed)
-        drawn = OncePerFrame(camera.to(cfg.device)) if once else camera.to(cfg.device)
+        transforms: list[Transform] = [DisturbedView(self.town, length, seed=cfg.seed, **disturbed)]
+        transforms.append(DeviceCastTransform(cfg.device))
+        if isinstance(sampler, SnippetSampler) or keys.IMAGE in self.policy.in_keys:
+            camera = make_camera(self.town, cfg.modality, appearance=cfg.appearance, seed=cfg.seed).to(cfg.device)
+            transforms.append(camera if isinstance(sampler, SnippetSampler) else OncePerFrame(camera))
         return TensorDictReplayBuffer(
-            storage=self.demonstrations.storage,
-            sampler=sampler,
-            batch_size=frames,
-            transform=Compose(moved, DeviceCastTransform(cfg.device), drawn),
+            storage=self.demonstrations.storage, sampler=sampler, batch_size=frames, transform=Compose(*transforms)
         )
 
     def language(self) -> None:
@@ -128,7 +128,7 @@ class Training:
             self.fit("high_level", [SubtaskLoss(self.policy)], decisions, cfg.batch_sequences)
         else:
             sampler = DriveSampler(self.demonstrations, self.town, cfg.drive_length, **settings)
-            drives = self.view(sampler, cfg.batch_drives * cfg.drive_length, cfg.drive_length, once=True)
+            drives = self.view(sampler, cfg.batch_drives * cfg.drive_length, cfg.drive_length)
             self.fit("drives", [SinglePolicyLoss(self.policy)], drives, cfg.batch_drives)
         encoder.requires_grad_(True)
 
@@ -202,6 +202,8 @@ def main(cfg: DictConfig) -> None:
             raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
         towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
         sizes = OmegaConf.to_container(cfg.size)
+        if cfg.misleading and not MODELS[cfg.model].hierarchical:
+            raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
         agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
         for checkpoint in cfg.start_from:
             copied = start_from(agent, str(checkpoint))

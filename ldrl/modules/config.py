@@ -58,7 +58,8 @@ class AgentConfig:
         high_level_hidden: size of the high-level GRU, or of the single policy's.
 
     Raises:
-        ValueError: a size is no whole number above 0, ``instruction_hidden`` is odd, or the model or the modality is unknown.
+        ValueError: a size is no whole number above 0, ``instruction_hidden`` is odd, or the model or the modality is
+            unknown.
     """
 
     model: str = "hih"

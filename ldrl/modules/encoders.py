@@ -24,8 +24,9 @@ BUMPER = (slice(-10, None), slice(60, 140))
 class ImageEncoder(nn.Module):
     """Three convolutions with ELU.
 
-    Colours are taken relative to the mean colour of the road in front of the car and to their spread, so that neither the light nor the
-    asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look from that patch).
+    Colours are taken relative to the mean colour of the road in front of the car and to the image's contrast, so that
+    neither the light nor the asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look from
+    that patch).
 
     Args:
         in_channels: channels of the image.
