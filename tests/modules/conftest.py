@@ -18,7 +18,7 @@ def tiny():
         conv_channels=(2, 3, 4),
         features=8,
         low_level_hidden=6,
-        instruction_hidden=5,
+        instruction_hidden=6,
         subtask_embedding=3,
         high_level_hidden=7,
     )

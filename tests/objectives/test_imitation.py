@@ -16,7 +16,7 @@ SENTENCES = ("turn left", "take the second right", "straight", "left and then st
 
 @pytest.fixture
 def agent():
-    sizes = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "instruction_hidden": 5}
+    sizes = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "instruction_hidden": 6}
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return HierarchicalAgent(AgentConfig(**sizes, subtask_embedding=3, high_level_hidden=7)).eval()
