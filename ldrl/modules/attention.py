@@ -21,7 +21,7 @@ class LuongAttention(nn.Module):
     def __init__(self, encoder: int, decoder: int) -> None:
         super().__init__()
         self.score = nn.Linear(encoder, decoder, bias=False)
-        self.relevance = nn.Linear(encoder, 1)
+        self.relevance = nn.Linear(encoder, 1, bias=False)
 
     def forward(self, states: Tensor, is_word: Tensor, decoder: Tensor) -> Tensor:
         """Attend to words.

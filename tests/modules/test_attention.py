@@ -15,6 +15,7 @@ def words(lengths, longest=5, size=3, seed=0):
 def test_luong_by_hand():
     attention = LuongAttention(2, 2)
     attention.score.weight.data = torch.tensor([[0.0, 1.0], [2.0, 0.0]])
+    attention.relevance.weight.data.zero_()
     states = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [9.0, 9.0]]])
     is_word = torch.tensor([[True, True, False]])
     # The scores are (0, 2) . (1, 0.5) = 1 and (1, 0) . (1, 0.5) = 1: both words alike.
@@ -22,6 +23,16 @@ def test_luong_by_hand():
     # And 0 and log 3: one part of the first and three of the second.
     decoder = torch.tensor([[math.log(3), 0.0]])
     torch.testing.assert_close(attention(states, is_word, decoder), torch.tensor([[0.25, 0.75]]))
+    # By themselves the words count log 9 and 0, which together with 0 and log 3 makes three parts and one.
+    attention.relevance.weight.data = torch.tensor([[math.log(9), 0.0]])
+    torch.testing.assert_close(attention(states, is_word, decoder), torch.tensor([[0.75, 0.25]]))
+
+
+def test_luong_attends_at_the_first_decision():
+    states, is_word = words([5, 2, 1])
+    attention = LuongAttention(3, 4)
+    found = attention(states, is_word, torch.zeros(3, 4))
+    assert not torch.allclose(found[0], states[0].mean(0), atol=1e-3)
 
 
 def test_luong_is_the_plain_loop():
@@ -31,7 +42,11 @@ def test_luong_is_the_plain_loop():
     decoder = torch.randn(3, 4)
     found = attention(states, is_word, decoder)
     for row, length in enumerate(lengths):
-        scores = [((attention.score.weight @ states[row, k]) @ decoder[row]).item() for k in range(length)]
+        alone = attention.relevance.weight[0]
+        scores = [
+            ((attention.score.weight @ states[row, k]) @ decoder[row] + alone @ states[row, k]).item()
+            for k in range(length)
+        ]
         total = sum(math.exp(score) for score in scores)
         mean = sum(math.exp(score) / total * states[row, k] for k, score in enumerate(scores))
         torch.testing.assert_close(found[row], mean)

@@ -22,10 +22,27 @@ def test_image_features(rows, channels):
     assert features[0, 0].numel() == encoder.out_features
     for i in range(2):
         alone = images[i, 3, :, 88 - rows :].float() / 255
+        road = alone[:, -10:, 60:140].mean((1, 2), keepdim=True)
+        alone = (alone - road) / (alone[:, ::4, ::4].std() + 0.03)
         for layer in encoder.layers:
             alone = layer(alone)
         torch.testing.assert_close(features[i, 3], alone)
     assert features.requires_grad
+
+
+def test_the_road_itself_is_seen_as_it_is():
+    encoder = ImageEncoder(1, (2, 3, 4), 48)
+    image = torch.randint(0, 2, (2, 1, 88, 200), dtype=torch.uint8) * 255
+    torch.testing.assert_close(encoder(image), encoder.layers(image[:, :, -48:].float() / 255))
+
+
+def test_light_and_contrast_hardly_matter():
+    encoder = ImageEncoder(3, (2, 3, 4), 48)
+    image = torch.randint(60, 120, (1, 3, 88, 200), dtype=torch.uint8)
+    brighter = image + torch.tensor([[60], [20], [90]], dtype=torch.uint8).view(1, 3, 1, 1)
+    torch.testing.assert_close(encoder(brighter), encoder(image), atol=1e-4, rtol=1e-4)
+    stretched = (image - 60) * 3
+    torch.testing.assert_close(encoder(stretched), encoder(image), atol=0.3, rtol=0.3)
 
 
 def test_paper_size_of_image_features():
@@ -52,13 +69,16 @@ def test_words_against_the_plain_recurrence(encoder):
     tokens = Tokenizer(max_tokens=7)(["turn left", "take the second right please", "straight"])
     states, is_word = encoder(tokens)
     assert states.shape == (3, 7, 6)
-    cell = torch.nn.GRUCell(50, 6)
-    cell.load_state_dict({name.removesuffix("_l0"): value for name, value in encoder.gru.state_dict().items()})
+    weights = encoder.gru.state_dict()
+    for suffix, half in (("_l0", slice(0, 3)), ("_l0_reverse", slice(3, 6))):
+        cell = torch.nn.GRUCell(50, 3)
+        cell.load_state_dict({k.removesuffix(suffix): v for k, v in weights.items() if k.endswith(suffix)})
+        for row, length in enumerate((2, 5, 1)):
+            state = torch.zeros(1, 3)
+            for k in range(length) if suffix == "_l0" else reversed(range(length)):
+                state = cell(WordEmbedding()(tokens[row, k : k + 1]), state)
+                torch.testing.assert_close(states[row, k, half], state[0])
     for row, length in enumerate((2, 5, 1)):
-        state = torch.zeros(1, 6)
-        for k in range(length):
-            state = cell(WordEmbedding()(tokens[row, k : k + 1]), state)
-            torch.testing.assert_close(states[row, k], state[0])
         assert is_word[row].tolist() == [True] * length + [False] * (7 - length)
         assert not states[row, length:].any()
 

@@ -7,9 +7,9 @@ import torch
 from tensordict import TensorDict
 
 from ldrl import keys
-from ldrl.language import Tokenizer
+from ldrl.language import KEYWORDS, Tokenizer
 from ldrl.modules import NO_SUBTASK, AgentConfig, HierarchicalAgent
-from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, SubtaskLoss
+from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SubtaskLoss
 
 SENTENCES = ("turn left", "take the second right", "straight", "left and then straight please")
 
@@ -208,6 +208,37 @@ def test_subtask_learns_through_time(agent, decisions):
         gradients.append(found[first].grad)
     changed = (gradients[0] - gradients[1]).abs().amax(-1) > 1e-8
     assert changed.tolist() == [True, False, False, False]
+
+
+def test_keyword_loss_is_the_plain_computation(agent):
+    tokens = Tokenizer()(SENTENCES)
+    keyword = torch.tensor([0, 13, 2, len(KEYWORDS)])
+    data = TensorDict({keys.INSTRUCTION_TOKENS: tokens, keys.KEYWORD: keyword}, [4])
+    loss = KeywordLoss(agent.high_level)
+    found = loss(data.unsqueeze(-1))
+    states, is_word = agent.high_level[0].module(tokens)
+    said = agent.high_level[1].module(states, is_word, torch.zeros(4, 7))
+    logits = loss.head(said)
+    plain = [-logits[k].log_softmax(-1)[keyword[k]] for k in range(4)]
+    torch.testing.assert_close(found["loss_keyword"], sum(plain) / 4)
+    right = sum(int(logits[k].argmax() == keyword[k]) for k in range(4))
+    assert found["accuracy_keyword"] == right / 4
+
+
+def test_keyword_loss_trains_what_reads(agent):
+    loss = KeywordLoss(agent.high_level)
+    data = TensorDict({keys.INSTRUCTION_TOKENS: Tokenizer()(SENTENCES), keys.KEYWORD: torch.arange(4)}, [4])
+    optimizer = torch.optim.Adam(loss.parameters(), 0.02)
+    losses = []
+    for _ in range(40):
+        losses.append(loss(data)["loss_keyword"])
+        losses[-1].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    assert losses[-1] < 0.3 * losses[0]
+    assert loss(data)["accuracy_keyword"] == 1
+    trained = {name for name, parameter in agent.high_level.named_parameters() if parameter.requires_grad}
+    assert any(name.startswith("module.0.module.gru") for name in trained)
 
 
 @pytest.mark.parametrize(
