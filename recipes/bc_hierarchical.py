@@ -5,7 +5,7 @@
     python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
     python recipes/bc_hierarchical.py preset=rgb               # from colour images
     python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
-    python recipes/bc_hierarchical.py model=h0 start_from=[runs/hih] stages=[high_level]
+    python recipes/bc_hierarchical.py model=h0 start_from.low_level=runs/hih start_from.language=runs/hih stages=[high_level]
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """
@@ -133,8 +133,8 @@ class Training:
         encoder.requires_grad_(True)
 
 
-def start_from(agent: Agent, checkpoint: str) -> list[str]:
-    """Copy the parts of a trained agent that fit: same name, same tensors.
+def start_from(agent: Agent, stage: str, checkpoint: str) -> list[str]:
+    """Copy the parts of a trained agent that a stage trains, where they fit: same name, same tensors.
 
     Returns:
         Their names.
@@ -144,12 +144,13 @@ def start_from(agent: Agent, checkpoint: str) -> list[str]:
     theirs = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
     copied: list[str] = []
     for name, module in agent.named_modules():
+        words, instructed = name.startswith(f"{own}.module.0"), name.startswith(f"{own}.")
+        learned = "language" if words else "high_level" if instructed else "low_level"
         inside = any(name.startswith(f"{part}.") for part in copied)
-        fits = name and type(theirs.get(name)) is type(module) and len(module.state_dict()) and not inside
-        if not fits:
+        if learned != stage or name == own or inside or type(theirs.get(name)) is not type(module):
             continue
         weights = theirs[name].state_dict()
-        if {k: v.shape for k, v in weights.items()} == {k: v.shape for k, v in module.state_dict().items()}:
+        if weights and {k: v.shape for k, v in weights.items()} == {k: v.shape for k, v in module.state_dict().items()}:
             module.load_state_dict(weights)
             copied.append(name)
     return copied
@@ -205,9 +206,10 @@ def main(cfg: DictConfig) -> None:
         if cfg.misleading and not MODELS[cfg.model].hierarchical:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
         agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
-        for checkpoint in cfg.start_from:
-            copied = start_from(agent, str(checkpoint))
-            print(f"Taken from {checkpoint}: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        for stage, checkpoint in cfg.start_from.items():
+            if checkpoint is not None:
+                copied = start_from(agent, stage, str(checkpoint))
+                print(f"{stage} from {checkpoint}: {', '.join(copied) or 'nothing, as nothing fits'}")
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
