@@ -5,7 +5,7 @@
     python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
     python recipes/bc_hierarchical.py preset=rgb               # from colour images
     python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
-    python recipes/bc_hierarchical.py model=h0 start_from.low_level=runs/hih start_from.language=runs/hih stages=[high_level]
+    python recipes/bc_hierarchical.py model=hi stages=[language,high_level] start_from.low_level=runs/hih
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """
@@ -147,7 +147,7 @@ def start_from(agent: Agent, stage: str, checkpoint: str) -> list[str]:
         words, instructed = name.startswith(f"{own}.module.0"), name.startswith(f"{own}.")
         learned = "language" if words else "high_level" if instructed else "low_level"
         inside = any(name.startswith(f"{part}.") for part in copied)
-        if learned != stage or name == own or inside or type(theirs.get(name)) is not type(module):
+        if name in ("", own) or learned != stage or inside or type(theirs.get(name)) is not type(module):
             continue
         weights = theirs[name].state_dict()
         if weights and {k: v.shape for k, v in weights.items()} == {k: v.shape for k, v in module.state_dict().items()}:
