@@ -96,23 +96,24 @@ def test_drives_that_end_in_a_manoeuvre_are_no_segments(town2, labels):
 
 @pytest.fixture
 def say(monkeypatch):
-    """Lets the passengers say the keyword itself, and keeps which split was asked."""
-    splits = []
+    """Lets the passengers say the keyword itself, without drawing anything, or one nonsense word."""
 
     class Plain:
-        def __init__(self, split):
-            splits.append(split)
+        def __init__(self, glove, max_words):
+            assert max_words == 48
 
-        def sample(self, keyword, rng):
+        def say(self, keyword, rng):
             return keyword.name
 
-    monkeypatch.setattr(segments, "Sentences", Plain)
-    return splits
+        def nonsense(self, rng):
+            return "zzyzzyx"
+
+    monkeypatch.setattr(segments, "Passenger", Plain)
 
 
 @pytest.fixture
 def sampled(demonstrations, town2, say):
-    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0)
+    sampler = BoundarySampler(demonstrations, town2)
     index, info = sampler.sample(demonstrations.storage, 600 * sampler.decisions)
     shape = (600, sampler.decisions)
     return index.view(shape), {key: value.view(*shape, *value.shape[1:]) for key, value in info.items()}
@@ -207,7 +208,7 @@ def test_without_misleading_instructions_the_draws_stay_what_they_were(demonstra
     subtask, drive, lane = labels
     snippets = cut_snippets(subtask, drive)
     found, rng = find_segments(town2, snippets, lane), random.Random(7)
-    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0, seed=7)
+    sampler = BoundarySampler(demonstrations, town2, seed=7)
     index, _ = sampler.sample(demonstrations.storage, 20 * sampler.decisions)
     for frames in index.view(20, -1).tolist():
         segment = rng.choice(found[rng.choice(list(KEYWORDS.values())).name]).snippets
@@ -217,11 +218,7 @@ def test_without_misleading_instructions_the_draws_stay_what_they_were(demonstra
         assert frames[0] == frame
         for _ in segment[1 + (frame >= boundary) :]:
             rng.randint(-4, 8)
-        rng.random()  # whether the sentence is disturbed
-        if rng.random() < 0.03:
-            rng.random()
-            for _ in rng.choices(sampler._words, k=rng.randint(1, 12)):
-                rng.random()
+        rng.random()  # whether it is nonsense
     assert sampler.state_dict()["random"] == rng.getstate()
 
 
@@ -256,7 +253,7 @@ def safe_answers(town, keyword, junctions):
 
 def test_misleading_decisions_are_the_safe_ones(demonstrations, town2, say, labels):
     subtask, drive, lane = labels
-    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0, misleading=1.0)
+    sampler = BoundarySampler(demonstrations, town2, misleading=1.0)
     index, info = sampler.sample(demonstrations.storage, 600 * sampler.decisions)
     shape = (600, sampler.decisions)
     rows = index.view(shape), {key: value.view(*shape, *value.shape[1:]) for key, value in info.items()}
@@ -285,7 +282,7 @@ def test_misleading_decisions_are_the_safe_ones(demonstrations, town2, say, labe
 
 
 def test_misleading_is_a_share(demonstrations, town2, say):
-    sampler = BoundarySampler(demonstrations, town2, disturbed=0.0, misleading=0.25)
+    sampler = BoundarySampler(demonstrations, town2, misleading=0.25)
     index, info = sampler.sample(demonstrations.storage, 800 * sampler.decisions)
     shape = (800, sampler.decisions)
     rows = index.view(shape), {key: value.view(*shape, *value.shape[1:]) for key, value in info.items()}
@@ -295,12 +292,6 @@ def test_misleading_is_a_share(demonstrations, town2, say):
         if name in SAFE_KEYWORDS
     ]
     assert 0.25 * 0.8 * 800 < sum(misled) < 0.25 * 1.2 * 800
-
-
-def test_splits(demonstrations, town2, say):
-    BoundarySampler(demonstrations, town2)
-    BoundarySampler(demonstrations, town2, split="heldout")
-    assert say == ["train", "heldout"]
 
 
 def test_real_sentences_are_said(demonstrations, town2):

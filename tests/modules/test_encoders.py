@@ -36,13 +36,12 @@ def test_the_road_itself_is_seen_as_it_is():
     torch.testing.assert_close(encoder(image), encoder.layers(image[:, :, -48:].float() / 255))
 
 
-def test_light_and_contrast_hardly_matter():
+def test_light_does_not_matter_and_contrast_hardly():
     encoder = ImageEncoder(3, (2, 3, 4), 48)
     image = torch.randint(60, 120, (1, 3, 88, 200), dtype=torch.uint8)
-    brighter = image + torch.tensor([[60], [20], [90]], dtype=torch.uint8).view(1, 3, 1, 1)
-    torch.testing.assert_close(encoder(brighter), encoder(image), atol=1e-4, rtol=1e-4)
-    stretched = (image - 60) * 3
-    torch.testing.assert_close(encoder(stretched), encoder(image), atol=0.3, rtol=0.3)
+    torch.testing.assert_close(encoder(image + 60), encoder(image), atol=1e-4, rtol=1e-4)
+    dim = (image - 60) * 3
+    assert (encoder(dim) - encoder(image)).abs().max() < 0.3 * encoder(image).abs().max()
 
 
 def test_paper_size_of_image_features():
