@@ -1,12 +1,12 @@
 """Networks as TensorDictModules, and the agents that they make."""
 
-from ldrl.modules.agent import HierarchicalAgent, make_agent
+from ldrl.modules.agent import Agent
 from ldrl.modules.attention import Concatenation, GatedAttention, LastWord, LuongAttention
-from ldrl.modules.base import Agent
 from ldrl.modules.checkpoint import PRETRAINED, load_agent, resolve_checkpoint, save_agent
 from ldrl.modules.config import MODELS, AgentConfig, Parts
 from ldrl.modules.controller import SwitchingController
 from ldrl.modules.encoders import ImageEncoder, InstructionEncoder
+from ldrl.modules.hierarchical import HierarchicalAgent, make_agent
 from ldrl.modules.high_level import NO_SUBTASK, Decoder, HighLevelPolicy, InstructedPolicy
 from ldrl.modules.low_level import BranchedGRU, LowLevelPolicy, SubtaskGate
 from ldrl.modules.sequences import unroll

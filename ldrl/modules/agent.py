@@ -1,124 +1,95 @@
-"""The hierarchical agent: the paper's figure as one policy; and the agent of any config."""
+"""What every agent has: a config, a memory in the TensorDict, and a step."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from typing import Self
+
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
-from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import TensorDictPrimer
 
 from ldrl import keys
-from ldrl.language import MAX_TOKENS
-from ldrl.modules.base import Agent
 from ldrl.modules.config import AgentConfig
-from ldrl.modules.controller import VOTES, SwitchingController
-from ldrl.modules.encoders import ImageEncoder
-from ldrl.modules.high_level import HighLevelPolicy
-from ldrl.modules.low_level import LowLevelPolicy, SubtaskGate
-from ldrl.modules.single import SingleAgent
-from ldrl.subtasks import SubTask
 
-__all__ = ["HierarchicalAgent", "make_agent"]
+__all__ = ["Agent"]
 
 
-class HierarchicalAgent(Agent):
-    """Language and image in, throttle and steer out: high-level policy, low-level policies, switching controller.
+class Agent(TensorDictModuleBase):
+    """Language and image in, throttle and steer out.
 
-    All parts are attributes and may be replaced by modules with the same keys. A call is one step of a batch of cars;
-    only rows that switch run the high-level policy.
+    The agent's memory lies in the TensorDict under ``"agent"``: :meth:`make_tensordict_primer` gives the transform
+    that an env needs to hold it. A subclass gives ``_memory``, ``_step`` and ``out_keys``.
 
     Args:
-        config: with a hierarchical model; None for the paper's full one.
-
-    Examples:
-        >>> from ldrl.envs import make_env
-        >>> agent = HierarchicalAgent()
-        >>> env = make_env("town1", num_cars=2, policy=agent)
-        >>> env.rollout(3, agent)["action"].shape
-        torch.Size([2, 3, 2])
+        config: which model, and its sizes.
     """
 
-    def __init__(self, config: AgentConfig | None = None) -> None:
-        super().__init__(AgentConfig() if config is None else config)
-        if not self.config.parts.hierarchical:
-            raise ValueError(f"model is {self.config.model!r}, which has no hierarchy; use make_agent")
-        self.high_level = HighLevelPolicy(self.config)
-        self.control = self._low_level("control", keys.ACTION, 2)
-        self.end_of_subtask = self._low_level("end", keys.END_LOGIT, 1)
-        self.controller = SwitchingController()
-        self.out_keys = [
-            keys.ACTION, keys.AGENT_SUBTASK, keys.AGENT_FINISH, keys.SWITCH, *(("next", *key) for key in self._memory)
-        ]  # fmt: skip
+    def __init__(self, config: AgentConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.modality = config.modality
 
-    def _low_level(self, name: str, out_key: NestedKey, outputs: int) -> LowLevelPolicy:
-        config = self.config
-        return LowLevelPolicy(
-            name,
-            out_key,
-            outputs,
-            encoder=ImageEncoder(config.image_channels, config.conv_channels, config.image_rows),
-            features=config.features,
-            hidden=config.low_level_hidden,
-            gate=None if config.parts.branched else SubtaskGate(config.subtask_embedding, config.conv_channels[-1]),
-        )
+    @classmethod
+    def from_pretrained(cls, name: str, device: torch.device | str = "cpu") -> Self:
+        """A trained agent; see :func:`~ldrl.modules.load_agent`.
+
+        Args:
+            name: a checkpoint that ships with the package, such as ``"hierarchical-gs"``, or a folder.
+            device: where the agent is to run.
+
+        Raises:
+            ValueError: the checkpoint is broken, or an agent of another class.
+        """
+        from ldrl.modules.checkpoint import load_agent
+
+        agent = load_agent(name, device)
+        if not isinstance(agent, cls):
+            raise ValueError(f"{name!r} is a {type(agent).__name__}, no {cls.__name__}; use load_agent")
+        return agent
 
     @property
+    @abstractmethod
     def _memory(self) -> dict[tuple[str, ...], TensorSpec]:
-        return {
-            keys.AGENT_SUBTASK: Categorical(len(SubTask), ()),
-            keys.VOTES: Bounded(0, 1, (VOTES,), dtype=torch.bool),
-            keys.AGE: Unbounded((), dtype=torch.int64),
-            keys.PLANNED_TOKENS: Unbounded((MAX_TOKENS,), dtype=torch.int64),
-            keys.HIGH_LEVEL_STATE: Unbounded((self.high_level.hidden,)),
-            self.control.state_key: Unbounded((self.control.hidden,)),
-            self.end_of_subtask.state_key: Unbounded((self.end_of_subtask.hidden,)),
-        }
+        """Key and spec of everything that the agent remembers, for one car."""
 
-    def decide(self, tensordict: TensorDictBase) -> None:
-        """Ask the high-level policy in the rows that switch."""
-        switch = tensordict[keys.SWITCH]
-        tensordict["next", *keys.HIGH_LEVEL_STATE] = tensordict[keys.HIGH_LEVEL_STATE].clone()
-        tensordict[keys.AGENT_SUBTASK] = tensordict[keys.AGENT_SUBTASK].clone()
-        rows = switch.nonzero().squeeze(-1)
-        if not len(rows):
-            return
-        asked = tensordict.select(*self.high_level.in_keys)[rows]
-        self.high_level(asked)
-        tensordict[keys.AGENT_SUBTASK][rows] = asked[keys.SUBTASK_LOGITS].argmax(-1)
-        tensordict["next", *keys.HIGH_LEVEL_STATE][rows] = asked["next", *keys.HIGH_LEVEL_STATE]
-
+    @abstractmethod
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.controller(tensordict)
-        self.decide(tensordict)
-        keep = ~tensordict[keys.SWITCH]
-        for policy in (self.control, self.end_of_subtask):
-            tensordict[policy.state_key] = tensordict[policy.state_key] * keep.unsqueeze(-1)
-            policy(tensordict)
-        subtask = tensordict[keys.AGENT_SUBTASK]
-        finish = subtask == SubTask.FINISH
-        throttle, steer = tensordict[keys.ACTION].unbind(-1)
-        vote = tensordict[keys.END_LOGIT] > 0
-        after = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
-        after[keys.ACTION] = torch.stack((throttle.clamp(0, 1) * ~finish, steer.clamp(-1, 1)), -1)
-        after[keys.AGENT_SUBTASK] = subtask
-        after[keys.AGENT_FINISH] = finish
-        after[keys.SWITCH] = tensordict[keys.SWITCH]
-        after["next"] = tensordict["next"]
-        after["next", *keys.AGENT_SUBTASK] = subtask
-        after["next", *keys.VOTES] = torch.cat((tensordict[keys.VOTES][..., 1:] & keep.unsqueeze(-1), vote), -1)
-        after["next", *keys.AGE] = tensordict[keys.AGE] * keep + 1
-        after["next", *keys.PLANNED_TOKENS] = tensordict[keys.PLANNED_TOKENS]
-        return after
+        """What a batch ``[B]`` of cars with ``in_keys`` does and remembers; may change its argument."""
 
+    @property
+    def in_keys(self) -> list:
+        """The image, the instruction and the memory."""
+        return [keys.IMAGE, keys.INSTRUCTION_TOKENS, *self._memory]
 
-def make_agent(config: AgentConfig) -> Agent:
-    """The untrained agent of a config.
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that gives an env's TensorDict the agent's memory, zero at each reset."""
+        memory = Composite()
+        for key, spec in self._memory.items():
+            memory[key] = spec
+        return TensorDictPrimer(memory, expand_specs=True)
 
-    Args:
-        config: its model says which class.
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """One step.
 
-    Examples:
-        >>> type(make_agent(AgentConfig(model="single-history"))).__name__
-        'SingleAgent'
-    """
-    return HierarchicalAgent(config) if config.parts.hierarchical else SingleAgent(config)
+        Args:
+            tensordict: batch size ``[B]`` with ``in_keys``.
+
+        Returns:
+            The same, with ``out_keys``: the action, what the agent says about it, and the memory for the next step
+            under ``("next", "agent")``.
+
+        Raises:
+            KeyError: an input or the memory is missing: the env lacks a transform, such as
+                :meth:`make_tensordict_primer`.
+        """
+        missing = [key for key in self.in_keys if key not in tensordict.keys(True, True)]
+        if missing:
+            raise KeyError(
+                f"{missing[0]} is missing; give the env a DashCamera, an Instruction and agent.make_tensordict_primer()"
+            )
+        if tensordict.batch_dims == 0:
+            return tensordict.update(self(tensordict.unsqueeze(0)).squeeze(0))
+        return tensordict.update(self._step(tensordict.select(*self.in_keys)))

@@ -11,9 +11,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from ldrl.modules.agent import make_agent
-from ldrl.modules.base import Agent
+from ldrl.modules.agent import Agent
 from ldrl.modules.config import AgentConfig
+from ldrl.modules.hierarchical import make_agent
 
 __all__ = ["PRETRAINED", "load_agent", "resolve_checkpoint", "save_agent"]
 

@@ -9,7 +9,7 @@ from torchrl.data import Bounded, TensorSpec, Unbounded
 
 from ldrl import keys
 from ldrl.language import MAX_TOKENS
-from ldrl.modules.base import Agent
+from ldrl.modules.agent import Agent
 from ldrl.modules.config import AgentConfig
 from ldrl.modules.high_level import InstructedPolicy
 

@@ -11,7 +11,7 @@ from ldrl import keys
 from ldrl.envs import make_env
 from ldrl.language import Tokenizer
 from ldrl.modules import AgentConfig, HierarchicalAgent
-from ldrl.modules.agent import VOTES
+from ldrl.modules.hierarchical import VOTES
 from ldrl.subtasks import SubTask
 
 LEFT, RIGHT, STRAIGHT, FOLLOW, FINISH = SubTask
