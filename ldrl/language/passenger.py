@@ -37,8 +37,10 @@ MEANINGFUL = frozenset(
 """Words that say which way and how often; nothing random happens to them."""
 FREQUENT = 20_000
 """How many of the most frequent words can be put into a sentence at random."""
-LOOSE = 0.4
+LOOSE = 0.6
 """Share of commands that are put in a looser phrasing than the templates'."""
+OPTIONAL = 0.2
+"""Probability that a loose phrasing has a part that it may leave out."""
 CLEAN = 0.2
 """Share of commands that are said without anything around them."""
 CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.3, 0.1, 0.25, 0.5
@@ -96,7 +98,7 @@ class Passenger:
 
     def nonsense(self, rng: random.Random) -> str:
         """Known and unknown words at random, or talk that asks for nothing: 1 to 12 words."""
-        talk = _talk(rng)
+        talk = rng.choice(_spoken()["slots"]["talk"])
         if len(talk.split()) > 2 and rng.random() < 0.3:
             return talk
         unknown = rng.random()
@@ -106,8 +108,14 @@ class Passenger:
     def _phrase(self, keyword: Keyword, rng: random.Random) -> str:
         if rng.random() >= LOOSE:
             return self._sentences.sample(keyword, rng)
-        body = rng.choice(_phrasings(keyword.name))
-        return rng.choice(_spoken()["frames"]).format(body=body)
+        parts = []
+        for slot in rng.choice(_loosely(keyword.name)):
+            name, _, of_then = slot.strip("()").partition(":")
+            if not slot.startswith("(") or rng.random() < OPTIONAL:
+                then = keyword.manoeuvres[-1].name.lower()
+                words = {"dir": then if of_then else keyword.manoeuvres[0].name.lower(), "then": then}
+                parts.append(rng.choice(_spoken()["slots"][name]).format(**words))
+        return " ".join(parts)
 
     def _disturb(self, words: list[str], rng: random.Random) -> list[str]:
         """Drop, replace and insert words that do not say which way or how often."""
@@ -124,7 +132,7 @@ class Passenger:
 
     def _correct(self, words: list[str], rng: random.Random) -> list[str]:
         """Say something wrong first, and take it back: the last word counts."""
-        marker = rng.choice(_spoken()["corrections"]).split()
+        marker = rng.choice(_spoken()["slots"]["corrections"]).split()
         spots = [k for k, word in enumerate(words) if word in DIRECTIONS or word in ORDINALS]
         if not spots or rng.random() < 0.3:
             wrong = self._phrase(rng.choice(list(KEYWORDS.values())), rng).split()
@@ -137,21 +145,21 @@ class Passenger:
 
     def _repeat(self, words: list[str], rng: random.Random) -> list[str]:
         """Say it again, in the same words."""
-        return words + rng.choice(_spoken()["confirmations"]).split() + words
+        return words + rng.choice(_spoken()["slots"]["confirmations"]).split() + words
 
     def _fill(self, words: list[str], rng: random.Random) -> list[str]:
         """Fill pauses, or stammer."""
         for _ in range(rng.randint(1, 3)):
             spot = rng.randint(0, len(words))
             stammers = spot < len(words) and words[spot] not in MEANINGFUL and rng.random() < 0.3
-            said = [words[spot]] if stammers else rng.choice(_spoken()["fillers"]).split()
+            said = [words[spot]] if stammers else rng.choice(_spoken()["slots"]["fillers"]).split()
             words = words[:spot] + said + words[spot:]
         return words
 
     def _talk(self, words: list[str], rng: random.Random) -> list[str]:
         """Talk of other things before or after, with direction words in another sense."""
         for _ in range(rng.randint(1, 2)):
-            said = _talk(rng).split()
+            said = rng.choice(_spoken()["slots"]["talk"]).split()
             words = said + words if rng.random() < 0.6 else words + said
         return words
 
@@ -183,33 +191,23 @@ def _misspell(word: str, rng: random.Random) -> str:
     )
 
 
-def _talk(rng: random.Random) -> str:
-    part = rng.choices(_spoken()["talk"], weights=[len(part["rest"]) for part in _spoken()["talk"]])[0]
-    return f"{rng.choice(part['subject'])} {rng.choice(part['rest'])}".strip()
-
-
 @cache
 def _spoken() -> dict[str, Any]:
     return yaml.safe_load((resources.files(__package__) / "spoken.yaml").read_text("utf-8"))
 
 
 @cache
-def _phrasings(name: str) -> list[str]:
-    """The looser phrasings of a keyword."""
-    keyword = KEYWORDS[name]
-    words = {"dir": keyword.manoeuvres[0].name.lower(), "then": keyword.manoeuvres[-1].name.lower()}
-    return [
-        body.format(**words)
-        for group in _spoken()["phrasings"]
-        if name in group["keywords"]
-        for body in group["bodies"]
-    ]
+def _loosely(name: str) -> list[list[str]]:
+    """The slots of each way to put a keyword loosely."""
+    return [slots for group in _spoken()["groups"] if name in group["keywords"] for slots in group["sentences"]]
 
 
 @cache
 def training_words() -> tuple[str, ...]:
     """All words of the commands to train on, those that say which way and how often first."""
-    sentences = Sentences("train")
-    words = {word for name in KEYWORDS for part in (*sentences.parts(name), *_phrasings(name)) for word in part.split()}
-    words.update(word for frame in _spoken()["frames"] for word in frame.format(body="").split())
+    parts = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
+    used = {slot.strip("()").partition(":")[0] for name in KEYWORDS for slots in _loosely(name) for slot in slots}
+    for slot in used - {"before", "after"}:
+        parts.update(part.format(dir="", then="") for part in _spoken()["slots"][slot])
+    words = {word for part in parts for word in part.split()}
     return tuple(sorted(words, key=lambda word: (word not in MEANINGFUL, word)))
