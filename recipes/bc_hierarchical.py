@@ -133,26 +133,31 @@ class Training:
         encoder.requires_grad_(True)
 
 
-def start_from(agent: Agent, stage: str, checkpoint: str) -> list[str]:
-    """Copy the parts of a trained agent that a stage trains, where they fit: same name, same tensors.
+def start_from(agent: Agent, checkpoints: Sequence[str]) -> list[str]:
+    """Copy parts of trained agents: the largest that fit (same name, same tensors), each from the first that has it.
 
     Returns:
         Their names.
     """
     # A single policy is made of the parts of a high-level policy.
     own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
-    theirs = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
+    trained = [
+        {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
+        for checkpoint in checkpoints
+    ]
     copied: list[str] = []
     for name, module in agent.named_modules():
-        words, instructed = name.startswith(f"{own}.module.0"), name.startswith(f"{own}.")
-        learned = "language" if words else "high_level" if instructed else "low_level"
-        inside = any(name.startswith(f"{part}.") for part in copied)
-        if name in ("", own) or learned != stage or inside or type(theirs.get(name)) is not type(module):
+        if not name or any(name.startswith(f"{part}.") for part in copied):
             continue
-        weights = theirs[name].state_dict()
-        if weights and {k: v.shape for k, v in weights.items()} == {k: v.shape for k, v in module.state_dict().items()}:
-            module.load_state_dict(weights)
-            copied.append(name)
+        shapes = {key: value.shape for key, value in module.state_dict().items()}
+        for theirs in trained:
+            if not shapes or type(theirs.get(name)) is not type(module):
+                continue
+            weights = theirs[name].state_dict()
+            if shapes == {key: value.shape for key, value in weights.items()}:
+                module.load_state_dict(weights)
+                copied.append(name)
+                break
     return copied
 
 
@@ -206,10 +211,9 @@ def main(cfg: DictConfig) -> None:
         if cfg.misleading and not MODELS[cfg.model].hierarchical:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
         agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
-        for stage, checkpoint in cfg.start_from.items():
-            if checkpoint is not None:
-                copied = start_from(agent, stage, str(checkpoint))
-                print(f"{stage} from {checkpoint}: {', '.join(copied) or 'nothing, as nothing fits'}")
+        if cfg.start_from:
+            copied = start_from(agent, [str(checkpoint) for checkpoint in cfg.start_from])
+            print(f"Taken from {', '.join(cfg.start_from)}: {', '.join(copied) or 'nothing, as nothing fits'}.")
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
@@ -222,7 +226,8 @@ def main(cfg: DictConfig) -> None:
             getattr(training, stage)()
     save_agent(agent, folder)
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}
-    plot_losses(losses, folder / "losses.png")
+    if losses:
+        plot_losses(losses, folder / "losses.png")
     write_report(cfg, agent, towns, folder, f"{time.perf_counter() - began:.0f} s")
 
 

@@ -3,50 +3,86 @@
     python recipes/evaluate.py checkpoint=hierarchical-gs
     python recipes/evaluate.py checkpoint=runs/seed1 episodes=mine.jsonl out=mine.json
     python recipes/evaluate.py checkpoint=hierarchical-gs episodes=maps/village.xodr
+    python recipes/evaluate.py checkpoint=hierarchical-gs episodes=rambling
+    python recipes/evaluate.py checkpoint=hierarchical-rgb episodes=unseen appearance=rain
 
-`checkpoint` is a folder or the name of a checkpoint that ships with the package; `episodes` is a JSON-lines file,
-`builtin` for the planner's episodes in the built-in towns, or an OpenDRIVE map for the planner's episodes there; `out`
-is the JSON file to write, none by default.
+`checkpoint` is a folder or the name of a checkpoint that ships with the package; `out` is the JSON file to write, none
+by default. `episodes` is a JSON-lines file; an OpenDRIVE map for the planner's episodes there; or, in the built-in
+towns, `builtin` for the planner's episodes, `paraphrase`, `ambiguity`, `noise` or `rambling` for the same in such
+sentences, `misleading` for directions that the map does not allow; or `unseen` for the planner's in random towns.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import get_args
 
 import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ldrl.collectors import evaluate
-from ldrl.collectors.report import check_writable, keyword_table, table, write_json
-from ldrl.envs import builtin_episodes, load_episodes
+from ldrl.collectors.report import PAPER, PAPER_MISLEADING, check_writable, keyword_table, table, write_json
+from ldrl.envs import DashCamera, Episode, builtin_episodes, load_episodes, misleading_episodes
+from ldrl.language import Family
 from ldrl.modules import load_agent
-from ldrl.towns import LAYOUTS, Town
+from ldrl.towns import LAYOUTS, Town, random_town
+
+FAMILIES = get_args(Family)
+SETS = ("builtin", *FAMILIES, "misleading", "unseen")
+
+
+def choose_episodes(cfg: DictConfig) -> Iterator[tuple[dict[str, Town], list[Episode]]]:
+    """Towns and their episodes; planned ones a town at a time, so that many towns need no memory together."""
+    source = str(cfg.episodes)
+    most = {} if cfg.routes_per_keyword is None else {"most_routes": cfg.routes_per_keyword}
+    if source == "unseen":
+        for k in range(cfg.unseen_towns):
+            town = random_town(k)
+            yield {town.name: town}, builtin_episodes(town, **({"most_routes": 2} | most))
+    elif source in SETS or source.endswith(".xodr"):
+        for town in map(Town.load, LAYOUTS if source in SETS else [source]):
+            if source == "misleading":
+                yield {town.name: town}, misleading_episodes(town, **most)
+            else:
+                yield {town.name: town}, builtin_episodes(town, source if source in FAMILIES else "heldout", **most)
+    elif Path(source).is_file():
+        towns = {name: Town.load(name) for name in LAYOUTS}
+        yield towns, load_episodes(source, towns)
+    else:
+        raise ValueError(
+            f"there is no episode file {source!r}; give a JSON-lines file, a map (.xodr) or one of {', '.join(SETS)}"
+        )
 
 
 @hydra.main(config_path="config", config_name="evaluate", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Check everything, then drive."""
     try:
-        if cfg.num_cars < 1:
-            raise ValueError(f"num_cars is {cfg.num_cars}; give at least 1")
+        for name in ("num_cars", "unseen_towns", "routes_per_keyword"):
+            if cfg[name] is not None and cfg[name] < 1:
+                raise ValueError(f"{name} is {cfg[name]}; give at least 1")
         agent = load_agent(str(cfg.checkpoint), cfg.device)
-        source = str(cfg.episodes)
-        loaded = [Town.load(name) for name in ([source] if source.endswith(".xodr") else LAYOUTS)]
-        towns = {town.name: town for town in loaded}
-        if source == "builtin" or source.endswith(".xodr"):
-            episodes = [episode for town in loaded for episode in builtin_episodes(town)]
-        else:
-            episodes = load_episodes(source, towns)
-        if not episodes:
-            raise ValueError(f"no keyword can be realised in {source}; give a map with junctions")
+        chosen = choose_episodes(cfg)
+        first = next(chosen)
+        if not first[1]:
+            raise ValueError(f"no keyword can be realised in {cfg.episodes}; give a map with junctions")
+        DashCamera(next(iter(first[0].values())), appearance=cfg.appearance)
         if cfg.out is not None:
             check_writable(str(cfg.out))
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
-    with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
-        outcomes = evaluate(agent, episodes, towns, num_cars=cfg.num_cars, device=cfg.device, progress=bar.update)
-    print(f"{table(outcomes)}\n\n{keyword_table(outcomes)}")
+    settings = {"num_cars": cfg.num_cars, "appearance": cfg.appearance, "device": cfg.device}
+    outcomes = []
+    with tqdm(desc="evaluation", unit="episode", total=0) as bar:
+        for towns, episodes in chain([first], chosen):
+            bar.total += len(episodes)
+            outcomes += evaluate(agent, episodes, towns, progress=bar.update, **settings)
+    paper = PAPER_MISLEADING if cfg.episodes == "misleading" else PAPER
+    print(f"{table(outcomes, paper)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
         write_json(outcomes, str(cfg.out))
         print(f"Every episode's outcome is in {cfg.out}.")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ldrl.collectors.evaluation import FINISH_NEAR, NEAR, Outcome
+from ldrl.collectors.paper import SUCCESS
 from ldrl.language import KEYWORDS
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "PAPER_MISLEADING",
     "check_writable",
     "keyword_table",
+    "markdown_table",
     "replacing",
     "summarise",
     "table",
@@ -28,16 +30,10 @@ __all__ = [
     "write_json",
 ]
 
-PAPER: dict[str, dict[str, float]] = {
-    "town1": {"single": 1.000, "double": 1.000, "ordinal": 1.000, "all": 1.000},
-    "town2": {"single": 1.000, "double": 0.986, "ordinal": 0.938, "all": 0.970},
-}
+PAPER = SUCCESS["gs-hih"]
 """Success of the paper's full model, Hih: Roh et al. 2019, Table 2, ``gs``; train is Town 1, test is Town 2.
 For double in Town 2 its Table 3 prints 0.960."""
-PAPER_MISLEADING: dict[str, dict[str, float]] = {
-    "town1": {"single": 1.000, "double": 1.000, "all": 1.000},
-    "town2": {"single": 1.000, "double": 0.928, "all": 0.946},
-}
+PAPER_MISLEADING = SUCCESS["gs-hih-misleading"]
 """The same for misleading instructions only."""
 NOTES = (
     f"- success, the paper's measure: no collision, and every point of the path within {NEAR:.0f} m of the track; "
@@ -48,6 +44,7 @@ NOTES = (
     "- paper: success of Hih on ground-truth segmentation, Table 2 of Roh et al. 2019 (train: Town 1, test: Town 2), "
     "on routes of its own in CARLA. Its Table 3 prints 0.960 for double in Town 2, where Table 2 has 0.986.",
 )
+MOST_SHOWN_TOWNS = 4
 SHOWN_CHARACTERS = 160  # of an instruction in the Markdown report; the JSON file has all
 
 
@@ -64,11 +61,20 @@ def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """
     towns = {}
     for town in dict.fromkeys(outcome.episode.town for outcome in outcomes):
-        here = [outcome for outcome in outcomes if outcome.episode.town == town]
-        keywords = [outcome.episode.keyword for outcome in here]
-        types = _grouped(here, [KEYWORDS[keyword].type for keyword in keywords], ("single", "double", "ordinal"))
-        towns[town] = _rates(here) | {"types": types, "keywords": _grouped(here, keywords, KEYWORDS)}
+        towns[town] = _by_meaning([outcome for outcome in outcomes if outcome.episode.town == town])
     return _rates(outcomes) | {"towns": towns}
+
+
+def _by_meaning(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    keywords = [outcome.episode.keyword for outcome in outcomes]
+    types = _grouped(outcomes, [KEYWORDS[keyword].type for keyword in keywords], ("single", "double", "ordinal"))
+    return _rates(outcomes) | {"types": types, "keywords": _grouped(outcomes, keywords, KEYWORDS)}
+
+
+def _summaries(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
+    """By town; many towns are one."""
+    towns = summarise(outcomes)["towns"]
+    return towns if len(towns) <= MOST_SHOWN_TOWNS else {f"{len(towns)} towns": _by_meaning(outcomes)}
 
 
 def _rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -172,25 +178,26 @@ def table(outcomes: Sequence[Outcome], paper: Mapping[str, Mapping[str, float]] 
         paper: success in the paper, by town and type.
 
     Returns:
-        A Markdown table: a row per town and type, then ``all``, with the paper's figure where it has one.
+        A Markdown table: a row per town and type, then ``all``, with the paper's figure where it has one. More than
+        four towns are taken together.
     """
     rows = [("town", "type", "episodes", "success", "strict success", "stuck", "paper")]
-    for town, summary in summarise(outcomes)["towns"].items():
+    for town, summary in _summaries(outcomes).items():
         for name, rates in (summary["types"] | {"all": summary}).items():
             rows.append((town, name, *_figures(rates), str(rates["stuck"]), _rate(paper.get(town, {}).get(name))))
-    return _markdown_table(rows, left=2)
+    return markdown_table(rows, left=2)
 
 
 def keyword_table(outcomes: Sequence[Outcome]) -> str:
-    """Success and strict success of every keyword as a Markdown table, the towns side by side."""
-    towns = summarise(outcomes)["towns"]
+    """Success and strict success of every keyword as a Markdown table, the towns, if four or fewer, side by side."""
+    towns = _summaries(outcomes)
     rows = [("keyword", "type", *(f"{town} {name}" for town in towns for name in ("episodes", "success", "strict")))]
     for keyword in KEYWORDS.values():
         groups = [summary["keywords"].get(keyword.name) for summary in towns.values()]
         if any(groups):
             figures = [_figures(rates) if rates else ("0", "-", "-") for rates in groups]
             rows.append((keyword.name, keyword.type, *(cell for group in figures for cell in group)))
-    return _markdown_table(rows, left=2)
+    return markdown_table(rows, left=2)
 
 
 def to_markdown(outcomes: Sequence[Outcome], *, title: str = "Report", details: Mapping[str, str] | None = None) -> str:
@@ -216,7 +223,7 @@ def to_markdown(outcomes: Sequence[Outcome], *, title: str = "Report", details: 
         _wrong_table(wrong) if wrong else "None.",
     ]
     if details:
-        parts += ["## Details", _markdown_table([("what", "value"), *details.items()], left=2)]
+        parts += ["## Details", markdown_table([("what", "value"), *details.items()], left=2)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -227,7 +234,7 @@ def _wrong_table(outcomes: Sequence[Outcome]) -> str:
         shown = instruction[:SHOWN_CHARACTERS] + "…" * (len(instruction) > SHOWN_CHARACTERS)
         happened = "; ".join(_what_happened(outcome))
         rows.append((outcome.episode.id, shown, "yes" if outcome.success else "no", happened))
-    return _markdown_table(rows, left=4)
+    return markdown_table(rows, left=4)
 
 
 def _what_happened(outcome: Outcome) -> Iterator[str]:
@@ -263,7 +270,7 @@ def _cell(text: str) -> str:
     return re.sub(r"([\\`*_|<>\[\]])", r"\\\1", text)
 
 
-def _markdown_table(rows: Sequence[Sequence[str]], left: int) -> str:
+def markdown_table(rows: Sequence[Sequence[str]], left: int) -> str:
     """A table whose first row is its header and whose first ``left`` columns are words, the others figures."""
     cells = [[_cell(text) for text in row] for row in rows]
     widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]

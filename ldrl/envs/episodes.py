@@ -90,16 +90,19 @@ def _is_finite(value: object) -> bool:
     return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
 
 
-def builtin_episodes(town: Town, split: Split | Family = "heldout", seed: int = 0) -> list[Episode]:
+def builtin_episodes(
+    town: Town, split: Split | Family = "heldout", seed: int = 0, most_routes: int = MOST_ROUTES
+) -> list[Episode]:
     """The built-in episodes: the distinct routes of every keyword that the town can realise.
 
-    Of a keyword with more than 40 routes, 40 are drawn. Each starts up to 35 m before its first junction and ends 5 to
-    10 m past the exit of its last manoeuvre.
+    Of a keyword with more than ``most_routes`` routes, so many are drawn. Each starts up to 35 m before its first
+    junction and ends 5 to 10 m past the exit of its last manoeuvre.
 
     Args:
         town: the town.
         split: which sentences the passengers say; nothing else of the episodes depends on it.
         seed: of the starts, ends, sentences and the routes where they are drawn.
+        most_routes: of one keyword.
 
     Raises:
         ValueError: there is no such split.
@@ -121,8 +124,8 @@ def builtin_episodes(town: Town, split: Split | Family = "heldout", seed: int = 
             routes = dict(enumerate(plan_routes(town, keyword)))
         except UnrealisableError:
             continue
-        if len(routes) > MOST_ROUTES:
-            routes = {k: routes[k] for k in sorted(rng.sample(sorted(routes), MOST_ROUTES))}
+        if len(routes) > most_routes:
+            routes = {k: routes[k] for k in sorted(rng.sample(sorted(routes), most_routes))}
         for k, route in routes.items():
             start = rng.uniform(0, min(START_BEFORE_JUNCTION, float(town.lane_length[route.lanes[0]])))
             end = min(rng.uniform(*END_BEHIND_JUNCTION), float(town.lane_length[route.lanes[-1]]))

@@ -55,16 +55,17 @@ def _routes(town: Town, keyword: Keyword) -> list[Route]:
         return []
 
 
-def misleading_episodes(town: Town, seed: int = 0) -> list[Episode]:
+def misleading_episodes(town: Town, seed: int = 0, most_routes: int = MOST_ROUTES) -> list[Episode]:
     """An episode for every misleading route of every single and double, said in held-out sentences.
 
-    Of a keyword with more than 40 routes, 40 are drawn. Starts and ends are those of the built-in episodes, but where
-    the car should stop: that path ends with the car's front at the junction, and where it is the first junction, no
-    start is so near that the car could not roll to a stop before it.
+    Of a keyword with more than ``most_routes`` routes, so many are drawn. Starts and ends are those of the built-in
+    episodes, but where the car should stop: that path ends with the car's front at the junction, and where it is the
+    first junction, no start is so near that the car could not roll to a stop before it.
 
     Args:
         town: the town.
         seed: of the starts, ends, sentences and the routes where they are drawn.
+        most_routes: of one keyword.
 
     Examples:
         >>> episode = misleading_episodes(Town.load("town2"))[0]
@@ -76,8 +77,8 @@ def misleading_episodes(town: Town, seed: int = 0) -> list[Episode]:
     episodes = []
     for keyword in SAFE_KEYWORDS.values():
         routes = dict(enumerate(misleading_routes(town, keyword)))
-        if len(routes) > MOST_ROUTES:
-            routes = {k: routes[k] for k in sorted(rng.sample(sorted(routes), MOST_ROUTES))}
+        if len(routes) > most_routes:
+            routes = {k: routes[k] for k in sorted(rng.sample(sorted(routes), most_routes))}
         for k, route in routes.items():
             name = f"misleading-{keyword.name.replace(',', '-')}-{k}"
             instruction = sentences.sample(keyword, rng)

@@ -1,0 +1,240 @@
+"""The page of results: the paper's tables with ours beside them, and where ours fall short."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import mean
+from typing import Any
+
+from ldrl.collectors.paper import LEAST_IOU, SUCCESS, TARGETS, Target
+from ldrl.collectors.report import markdown_table
+from ldrl.collectors.results import FOUR_WAY, T_ONLY, Result, Results
+
+__all__ = ["results_page"]
+
+TOWNS = {"town1": "Town 1", "town2": "Town 2", "unseen": "unseen towns"}
+TYPES = ("single", "double", "ordinal", "all")
+FULL = {f"Hih, {modality}": f"{modality}-hih" for modality in ("rgb", "gs", "ps")}
+MODELS = {
+    "single policy": "gs-single",
+    "single policy with history": "gs-single-history",
+    "NMC": "gs-nmc",
+    "H0": "gs-h0",
+    "Hi": "gs-hi",
+    "Hih": "gs-hih",
+    "Hihg": "gs-hihg",
+}
+BASELINES = ("gs-single", "gs-single-history", "gs-nmc")
+EVERY = {
+    f"{model}, {modality}": f"{modality}-{model.lower()}"
+    for model in ("H0", "Hi", "Hih")
+    for modality in ("rgb", "gs", "ps")
+}
+MISLEADING = {model: f"gs-{model.lower()}-misleading" for model in ("H0", "Hi", "Hih")}
+LOOKS = {"drawn for every image": "rgb-hih", "one: Town 1's own, clear weather": "rgb-hih-clear"}
+FAMILIES = {family: f"gs-hih-{family}" for family in ("paraphrase", "ambiguity", "noise", "rambling")}
+NAMES = {cell: name for table in (FULL, EVERY, MODELS) for name, cell in table.items()} | {
+    "gs-hih": "Hih, gs",
+    "gs-hih-unseen": "Hih, gs",
+    **{cell: f"{model}, misleading instructions" for model, cell in MISLEADING.items()},
+    **{cell: f"Hih, {family}" for family, cell in FAMILIES.items()},
+}
+INTRODUCTION = """\
+# Results
+
+The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_paper.py` writes this page from
+`results.json` beside it and from the finished cells of `runs/paper`; nothing here is typed by hand.
+
+- *success*, the paper's measure: no collision, and every point of the path within 10 m of the track. *strict success*:
+  also never off the road, never in an oncoming lane, and `finish` declared within 15 m of the path's end. *paper*: what
+  it reports as success, on routes of its own in CARLA; train is Town 1, test Town 2.
+- Trained on Town 1. Episodes are all routes of our planner in Town 1 and Town 2, each driven once, said in sentences
+  without a phrase of the training's.
+- A figure is the mean over the seeds, in brackets the least and the largest of them. "-" is not measured yet, or not
+  reported by the paper."""
+DEPARTURES = """\
+These concern the tables above; [the design](design.md#departures-from-the-paper) has all, with reasons.
+
+1. **World.** A flat town drawn from its lanes instead of CARLA, whose towns it cannot show: the paper's rgb looks
+   otherwise than ours, so that its rgb column says how hard CARLA's images are, too.
+2. **Episodes** are all routes of our planner, not the paper's 159 and 142, which are not published; so types are mixed
+   in another proportion in `all`.
+3. **Sentences** come from our own templates on the paper's scale, and evaluation says held-out ones only: harder than
+   the paper's, whose templates are the same in both.
+4. **Sizes and schedule.** Networks of 0.8 million parameters, trained in minutes on two CPU cores.
+5. **The reader is learned first**, from sentences alone, and then stays as it is: sentences are cheap and images are
+   not. All models but NMC, which lacks the attention, share it.
+6. **Models share the low level** of Hih where the paper's differ in the high level only.
+7. **rgb and ps start from the agent on gs**, the same road in other colours, which saves most of their training. H0's
+   high level sees no image, so that on rgb and ps it is that of gs.
+8. **rgb is normalised by the colour of the road in front of the car and trained in looks drawn for every image**;
+   the table of looks shows what the latter is worth.
+9. **ps** comes from a small DeepLabv3+ of our own, trained on random towns: no public weights know these images.
+10. **Views beside the path** are labelled by asking the expert there, where the paper shifts the steering of turned
+    cameras by a constant: recovery is learned exactly.
+11. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step.
+12. **Misleading instructions**: a quarter of those in training; the paper says no share."""
+
+
+def results_page(results: Results, cells: Sequence[str], segmenter: Mapping[str, Any]) -> str:
+    """The page, in Markdown.
+
+    Args:
+        results: whatever is measured.
+        cells: names of all cells, in the order of the table of times.
+        segmenter: the report of the road segmenter's training.
+    """
+    parts = [
+        INTRODUCTION,
+        f"Seeds: {', '.join(map(str, results.seeds)) or 'none yet'}.",
+        "## Where ours fall short",
+        *_shortfalls(results, segmenter),
+        "## What should be reached",
+        _targets(results),
+        "## Input modalities (the paper's Table 2)",
+        _table(results, "model", FULL, TYPES),
+        "## Models (Table 3), on gs",
+        _table(results, "model", MODELS, TYPES),
+        "## All hierarchical models over all modalities (Table A3)",
+        _table(results, "model", EVERY, ("all",)),
+        "## Misleading instructions only, on gs",
+        _table(results, "model", MISLEADING, ("single", "double", "all")),
+        "## Families of sentences, Hih on gs",
+        _families(results),
+        "## Unseen towns, Hih on gs",
+        _unseen(results),
+        "## Looks in training, Hih on rgb",
+        _table(results, "looks", LOOKS, TYPES),
+        "## Road segmenter of ps",
+        _segmenter(segmenter),
+        "## Time",
+        *_time(results, cells),
+        "## Departures from the paper",
+        DEPARTURES,
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _spread(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    least, largest = min(values), max(values)
+    return f"{mean(values):.3f}" + (f" ({least:.3f} to {largest:.3f})" if len(values) > 1 else "")
+
+
+def _table(results: Results, what: str, rows: Mapping[str, str], types: Sequence[str]) -> str:
+    """A row for each cell and type: success, strict success and the paper's success, both towns side by side."""
+    columns = ("success", "strict success", "paper")
+    lines = [(what, "type", *(f"{TOWNS[town]} {column}" for town in ("town1", "town2") for column in columns), "seeds")]
+    for name, cell in rows.items():
+        theirs = SUCCESS.get(cell.removesuffix("-clear"), {})
+        for type_ in types:
+            line = [name, type_]
+            for town in ("town1", "town2"):
+                line += [_spread(results.values(cell, town, type_, m)) for m in ("success", "strict_success")]
+                line.append(_spread([theirs[town][type_]] if theirs else []))
+            lines.append((*line, str(len(results.of(cell)))))
+    return markdown_table(lines, left=2)
+
+
+def _described(target: Target) -> tuple[str, str, str, str]:
+    measure = {"strict_success": "strict success", "kept": "success kept"}.get(target.measure, target.measure)
+    return NAMES[target.cell], TOWNS[target.town], target.type, measure
+
+
+def _targets(results: Results) -> str:
+    lines = [("model", "town", "type", "measure", "ours", "at least", "reached")]
+    for target in TARGETS:
+        values = results.values(*target[:4])
+        reached = "-" if not values else "yes" if round(mean(values), 3) >= target.least else "no"
+        lines.append((*_described(target), _spread(values), f"{target.least:.3f}", reached))
+    return markdown_table(lines, left=4)
+
+
+def _shortfalls(results: Results, segmenter: Mapping[str, Any]) -> Iterator[str]:
+    missed = [
+        f"- {', '.join(_described(target))}: {_spread(values)}, to reach is {target.least:.3f}."
+        for target in TARGETS
+        if (values := results.values(*target[:4])) and round(mean(values), 3) < target.least
+    ]
+    missed += [
+        f"- road segmenter, {TOWNS[row['town']]}, {row['look']}: {row['iou']:.3f}, to reach is {LEAST_IOU:.3f}."
+        for row in segmenter["rows"]
+        if row["iou"] < LEAST_IOU
+    ]
+    below: dict[bool, list[str]] = {True: [], False: []}
+    for cell, towns in SUCCESS.items():
+        for town, types in towns.items():
+            for type_, theirs in types.items():
+                values = results.values(cell, town, type_, "success")
+                if values and round(mean(values), 3) < theirs:
+                    line = f"- {NAMES[cell]}, {TOWNS[town]}, {type_}: {_spread(values)}, the paper's {theirs:.3f}."
+                    below[cell in BASELINES].append(line)
+    yield "Below what this project should reach:"
+    yield "\n".join(missed or ["- nothing that is measured"])
+    yield "Below the paper's success:"
+    yield "\n".join(below[False] or ["- nothing that is measured"])
+    yield "Baselines below the paper's, which are there to fail:"
+    yield "\n".join(below[True] or ["- none that is measured"])
+
+
+def _families(results: Results) -> str:
+    lines = [
+        ("sentences", *(f"{TOWNS[t]} {m}" for t in ("town1", "town2") for m in ("success", "strict success", "kept")))
+    ]
+    for family, cell in ({"clean": "gs-hih"} | FAMILIES).items():
+        line = [family]
+        for town in ("town1", "town2"):
+            line += [_spread(results.values(cell, town, "all", m)) for m in ("success", "strict_success")]
+            line.append(_spread(results.values(cell, town, "all", "kept")) if cell != "gs-hih" else "-")
+        lines.append(line)
+    table = markdown_table(lines, left=1)
+    return f"{table}\n\nThe same routes in other sentences; *kept* is success as a share of that on clean sentences."
+
+
+def _unseen(results: Results) -> str:
+    lines = [("type", "episodes", "success", "strict success")]
+    for type_ in (*TYPES, T_ONLY, FOUR_WAY, "worst town"):
+        episodes = results.values("gs-hih-unseen", "unseen", type_, "episodes")
+        rates = [results.values("gs-hih-unseen", "unseen", type_, m) for m in ("success", "strict_success")]
+        lines.append((type_, f"{mean(episodes):.0f}" if episodes else "-", *map(_spread, rates)))
+    table = markdown_table(lines, left=1)
+    return f"Random towns 0 to 49, in which nothing was trained; two routes of every keyword in each.\n\n{table}"
+
+
+def _segmenter(report: Mapping[str, Any]) -> str:
+    rows = {(row["town"], row["look"]): row for row in report["rows"]}
+    looks = dict.fromkeys(look for _, look in rows)
+    lines = [("look", *(f"{TOWNS[town]} {what}" for town in ("town1", "town2") for what in ("IoU", "worst view")))]
+    for look in looks:
+        both = (rows[town, look] for town in ("town1", "town2"))
+        lines.append((look, *(f"{row[name]:.3f}" for row in both for name in ("iou", "worst_view"))))
+    trained = report["details"]["training"]
+    return f"Intersection over union of the road. Trained: {trained}.\n\n{markdown_table(lines, left=1)}"
+
+
+def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:
+    known = [result for result in results if result.cell in cells]
+    for seed in results.seeds:
+        own = [result for result in known if result.seed == seed]
+        clock, added = _busy(own) / 60, sum(result.seconds for result in own) / 60
+        yield f"Seed {seed}: {len(own)} of {len(cells)} cells, {clock:.0f} minutes by the clock, {added:.0f} of cells."
+    for what in ("hardware", "versions"):
+        yield f"{what.capitalize()}: {'; '.join(sorted({getattr(result, what) for result in known})) or '-'}."
+    lines = [("cell", "minutes", "seeds", "command of the latest")]
+    for cell in cells:
+        made = results.of(cell)
+        minutes = [result.seconds / 60 for result in made]
+        spread = f"{mean(minutes):.1f} ({min(minutes):.1f} to {max(minutes):.1f})" if made else "-"
+        command = max(made, key=lambda result: result.began).command if made else "-"
+        lines.append((cell, spread, str(len(made)), command))
+    yield markdown_table(lines, left=1)
+
+
+def _busy(results: Sequence[Result]) -> float:
+    """Seconds in which at least one of them was under way."""
+    total, until = 0.0, 0.0
+    for result in sorted(results, key=lambda result: result.began):
+        total += max(0.0, result.began + result.seconds - max(until, result.began))
+        until = max(until, result.began + result.seconds)
+    return total

@@ -1,0 +1,195 @@
+"""The paper's tables with recipes that only pretend to train: what is run, in which order, and what is not."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+
+from ldrl.collectors import results_page
+from ldrl.collectors.paper import SUCCESS, TARGETS
+from ldrl.collectors.results import Results
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+CONFIG = yaml.safe_load((RECIPES / "config" / "reproduce_paper.yaml").read_text())
+FAKE = '''
+"""Logs its arguments, and writes what a recipe writes."""
+import json, os, sys
+from pathlib import Path
+given = dict(argument.split("=", 1) for argument in sys.argv[1:])
+print("driven with", os.environ["OMP_NUM_THREADS"])
+folder = Path(given["out"]).parent if "out" in given else Path("runs", given["name"])
+with open("calls.txt", "a") as calls:
+    calls.write(f"{folder.parent.name}/{folder.name}\\n")
+if folder.name == os.environ.get("BROKEN"):
+    (folder / "report.json").write_text("cut o")
+    sys.exit("error: the moon is down")
+folder.mkdir(parents=True, exist_ok=True)
+if "out" not in given:
+    (folder / "agent.safetensors").write_text(" ".join(sys.argv[1:]) + os.environ.get("WEIGHTS", ""))
+records = [
+    {"town": town, "keyword": keyword, "success": good, "strict_success": False}
+    for town in ("town1", "town2") for keyword, good in (("left", True), ("left,left", town == "town1"))
+]
+(folder / "report.json").write_text(json.dumps({"episodes": records}))
+'''
+
+
+@pytest.fixture
+def reproduce(tmp_path, monkeypatch, capfd):
+    """Runs the recipe in an empty folder on pretending recipes: what was made in order, its error, what it printed."""
+    spec = importlib.util.spec_from_file_location("reproduce_paper", RECIPES / "reproduce_paper.py")
+    recipe = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "reproduce_paper", recipe)
+    spec.loader.exec_module(recipe)
+    fakes = tmp_path / "fakes"
+    fakes.mkdir()
+    for name in ("bc_hierarchical.py", "evaluate.py"):
+        (fakes / name).write_text(FAKE)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.setattr(recipe, "RECIPES", fakes)
+
+    def reproduce(*arguments):
+        monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *arguments])
+        calls, error = Path("calls.txt"), None
+        calls.write_text("")
+        try:
+            recipe.main()
+        except SystemExit as exit_:
+            error = exit_.code
+        finally:
+            GlobalHydra.instance().clear()
+        return calls.read_text().split(), error, "".join(capfd.readouterr())
+
+    return reproduce
+
+
+def test_every_cell_once_and_after_what_it_needs(reproduce):
+    made, error, _ = reproduce()
+    assert error is None
+    assert sorted(made) == sorted(f"seed0/{cell}" for cell in CONFIG["cells"])
+    for cell, given in CONFIG["cells"].items():
+        for needed in [given["checkpoint"]] if "checkpoint" in given else given.get("start_from", []):
+            assert made.index(f"seed0/{needed}") < made.index(f"seed0/{cell}")
+    assert "driven with" in Path("runs/paper/seed0/gs-hih/output.txt").read_text()
+
+
+def test_only_what_a_table_needs(reproduce):
+    assert reproduce("tables=[unseen]", "seeds=[3,1]", "jobs=1")[0] == [
+        "seed3/gs-hih",
+        "seed3/gs-hih-unseen",
+        "seed1/gs-hih",
+        "seed1/gs-hih-unseen",
+    ]
+    assert reproduce("tables=[]")[0] == []
+
+
+def test_a_command_is_one_that_a_user_can_type(reproduce):
+    reproduce("tables=[input,unseen]")
+    made = json.loads(Path("runs/paper/seed0/rgb-h0/made.json").read_text())
+    assert made["command"] == (
+        "python recipes/bc_hierarchical.py name=paper/seed0/rgb-h0 seed=0 preset=default "
+        "'start_from=[runs/paper/seed0/rgb-hih,runs/paper/seed0/gs-h0]' 'stages=[]' model=h0 modality=rgb"
+    )
+    made = json.loads(Path("runs/paper/seed0/gs-hih-unseen/made.json").read_text())
+    assert made["command"] == (
+        "python recipes/evaluate.py checkpoint=runs/paper/seed0/gs-hih episodes=unseen "
+        "out=runs/paper/seed0/gs-hih-unseen/report.json"
+    )
+
+
+def test_a_finished_cell_is_not_made_again(reproduce):
+    reproduce("tables=[models]")
+    assert reproduce("tables=[models]")[0] == []
+    assert sorted(reproduce("tables=[models,unseen]")[0]) == ["seed0/gs-hih-unseen"]
+
+
+@pytest.mark.parametrize("lost", ["made.json", "report.json"])
+def test_a_cell_that_was_interrupted_is_made_again(reproduce, lost):
+    reproduce("tables=[unseen]")
+    Path("runs/paper/seed0/gs-hih-unseen", lost).unlink()
+    assert reproduce("tables=[unseen]")[0] == ["seed0/gs-hih-unseen"]
+
+
+def test_a_cell_whose_command_changed_is_made_again_with_what_starts_from_it(reproduce, monkeypatch):
+    reproduce("tables=[misleading]", "jobs=1")
+    changed = ("tables=[misleading]", "jobs=1", "+cells.gs-hi.high_level_steps=7")
+    made, error, printed = reproduce(*changed)
+    assert error is None
+    assert made == ["seed0/gs-hi", "seed0/gs-hi-misleading"]
+    assert "seed0/gs-hi: its command changed, so it is made again" in printed
+    assert "seed0/gs-hi-misleading: its weights changed, so it is made again" in printed
+    assert reproduce(*changed)[0] == []
+
+
+def test_the_same_weights_again_leave_what_starts_from_them(reproduce):
+    reproduce("tables=[unseen]")
+    Path("runs/paper/seed0/gs-hih/made.json").unlink()
+    assert reproduce("tables=[unseen]")[0] == ["seed0/gs-hih"]
+
+
+def test_a_failure_stops_the_run(reproduce, monkeypatch):
+    monkeypatch.setenv("BROKEN", "gs-hi")
+    made, error, printed = reproduce("tables=[misleading]", "jobs=1")
+    assert error == "error: seed0/gs-hi failed; run the same again to go on from here"
+    assert made == ["seed0/gs-hih", "seed0/gs-hi"]
+    assert "error: the moon is down" in printed
+    assert [result.cell for result in Results.load("docs/results.json")] == ["gs-hih"]
+    monkeypatch.delenv("BROKEN")
+    assert reproduce("tables=[misleading]", "jobs=1")[0][0] == "seed0/gs-hi"
+
+
+def test_results_outlive_the_runs(reproduce):
+    reproduce("tables=[unseen]", "seeds=[0]")
+    first = Path("docs/results.json").read_text()
+    Path("runs/paper").rename("gone")
+    reproduce("tables=[]")
+    assert Path("docs/results.json").read_text() == first
+    reproduce("tables=[unseen]", "seeds=[1]")
+    assert Results.load("docs/results.json").seeds == [0, 1]
+    # One of two doubles and all singles: three of four, and no seed differs.
+    page = Path("docs/results.md").read_text()
+    assert "| gs-hih " in page
+    assert "| Hih, gs    | all     | 1.000 (1.000 to 1.000) | 0.000" in page.replace("  ", "  ")
+
+
+def test_smoke_leaves_the_page_alone(reproduce):
+    made, error, _ = reproduce("preset=smoke", "tables=[unseen]")
+    assert error is None
+    assert made == ["seed0/gs-hih", "seed0/gs-hih-unseen"]
+    assert not Path("docs").exists()
+    assert Path("runs/paper-smoke/results.md").read_text().startswith("# Results")
+    command = json.loads(Path("runs/paper-smoke/seed0/gs-hih-unseen/made.json").read_text())["command"]
+    assert command.endswith("routes_per_keyword=1 unseen_towns=1")
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("tables=[input,output]", "tables has 'output'; use some of input, models, misleading, language, unseen"),
+        ("preset=huge", "preset has 'huge'; use some of default, smoke"),
+        ("jobs=0", "jobs is 0; give whole numbers of at least 1"),
+        ("seeds=[-1]", "seeds is [-1]; give whole numbers of at least 0"),
+        ("seeds=1", "seeds is 1; give a list, such as seeds=[1]"),
+        ("tables=input", "tables is 'input'; give a list, such as tables=[input]"),
+    ],
+)
+def test_bad_arguments(reproduce, argument, message):
+    made, error, _ = reproduce(argument)
+    assert message in error
+    assert made == []
+
+
+def test_the_page_has_a_place_for_every_cell():
+    shown = {
+        cell
+        for rows in ("FULL", "MODELS", "EVERY", "MISLEADING", "LOOKS", "FAMILIES")
+        for cell in getattr(results_page, rows).values()
+    }
+    assert shown | {"gs-hih-unseen"} == set(CONFIG["cells"])
+    assert set(SUCCESS) | {target.cell for target in TARGETS} <= set(CONFIG["cells"])
+    assert {cell for cells in CONFIG["contents"].values() for cell in cells} == set(CONFIG["cells"])
