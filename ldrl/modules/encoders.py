@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from ldrl.language import PADDING, WordEmbedding
+from ldrl.language import PADDING, Tokenizer, WordEmbedding
 
 __all__ = ["ImageEncoder", "InstructionEncoder"]
 
@@ -86,8 +86,16 @@ class ImageEncoder(nn.Module):
         return (absolute - offset[..., None, None]) / contrast + first.bias[:, None, None]
 
 
+DECISIVE = (
+    "left right straight first second next two twice times both another again more couple not don t no one once after "
+    "before past pass skip then and other neither until instead"
+)
+"""Words on which the meaning of an instruction turns. GloVe holds left and right, or first and second, for nearly the
+same, so these have a second vector that is learned."""
+
+
 class InstructionEncoder(nn.Module):
-    """Frozen GloVe vectors through a single-layer GRU that reads both ways.
+    """Frozen GloVe vectors, with learned ones of decisive words, through a single-layer GRU that reads both ways.
 
     In training the vectors are disturbed, so that words with like vectors come to count alike and a sentence is
     understood that was never trained on.
@@ -96,6 +104,7 @@ class InstructionEncoder(nn.Module):
         hidden: size of a word's state, half of it of the GRU that reads backwards; an even number.
         noise: standard deviation of Gaussian noise on the vectors in training.
         dropout: share of their components that is dropped in training.
+        decisive: size of the learned vectors; zero for all other words.
 
     Examples:
         >>> states, is_word = InstructionEncoder(32)(torch.tensor([[5, 6, 0, 0]]))
@@ -103,12 +112,17 @@ class InstructionEncoder(nn.Module):
         (torch.Size([1, 4, 32]), tensor([[ True,  True, False, False]]))
     """
 
-    def __init__(self, hidden: int, noise: float = 0.15, dropout: float = 0.1) -> None:
+    decisive_tokens: Tensor
+
+    def __init__(self, hidden: int, noise: float = 0.15, dropout: float = 0.1, decisive: int = 16) -> None:
         super().__init__()
         self.embedding = WordEmbedding()
+        tokens = Tokenizer()([DECISIVE])[0]
+        self.register_buffer("decisive_tokens", tokens[tokens != PADDING], persistent=False)
+        self.decisive = nn.Embedding(len(self.decisive_tokens) + 1, decisive, padding_idx=0)
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
-        self.gru = nn.GRU(50, hidden // 2, batch_first=True, bidirectional=True)
+        self.gru = nn.GRU(50 + decisive, hidden // 2, batch_first=True, bidirectional=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Encode instructions.
@@ -126,6 +140,9 @@ class InstructionEncoder(nn.Module):
         vectors = self.embedding(flat)
         if self.training:
             vectors = self.dropout(vectors + self.noise * torch.randn_like(vectors))
+        found = flat.unsqueeze(-1) == self.decisive_tokens
+        number = (found * torch.arange(1, found.shape[-1] + 1, device=flat.device)).sum(-1)
+        vectors = torch.cat((vectors, self.decisive(number)), -1)
         packed = pack_padded_sequence(vectors, length, batch_first=True, enforce_sorted=False)
         states, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=tokens.shape[-1])
         return states.view(*tokens.shape, -1), is_word.view(tokens.shape)
