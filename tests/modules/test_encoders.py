@@ -70,12 +70,16 @@ def test_words_against_the_plain_recurrence(encoder):
     assert states.shape == (3, 7, 6)
     weights = encoder.gru.state_dict()
     for suffix, half in (("_l0", slice(0, 3)), ("_l0_reverse", slice(3, 6))):
-        cell = torch.nn.GRUCell(50, 3)
+        cell = torch.nn.GRUCell(66, 3)
         cell.load_state_dict({k.removesuffix(suffix): v for k, v in weights.items() if k.endswith(suffix)})
         for row, length in enumerate((2, 5, 1)):
             state = torch.zeros(1, 3)
             for k in range(length) if suffix == "_l0" else reversed(range(length)):
-                state = cell(WordEmbedding()(tokens[row, k : k + 1]), state)
+                # Word vectors that are learned: of those that decide, and zeros for all others.
+                which = (encoder.decisive_tokens == tokens[row, k]).nonzero().flatten()
+                learned = encoder.decisive.weight[which[0] + 1] if len(which) else torch.zeros(16)
+                vector = torch.cat((WordEmbedding()(tokens[row, k]), learned))
+                state = cell(vector.unsqueeze(0), state)
                 torch.testing.assert_close(states[row, k, half], state[0])
     for row, length in enumerate((2, 5, 1)):
         assert is_word[row].tolist() == [True] * length + [False] * (7 - length)
@@ -121,5 +125,5 @@ def test_words_are_disturbed_in_training_only(encoder):
 
 
 def test_word_vectors_are_not_trained_and_not_saved(encoder):
-    assert {name.split(".")[0] for name in encoder.state_dict()} == {"gru"}
-    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == {"gru"}
+    assert {name.split(".")[0] for name in encoder.state_dict()} == {"decisive", "gru"}
+    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == {"decisive", "gru"}
