@@ -62,8 +62,8 @@ class Passenger:
     Examples:
         >>> Passenger().say("left", random.Random(6))
         'you should take a left turn'
-        >>> Passenger().nonsense(random.Random(3))
-        'let me check the map'
+        >>> Passenger().nonsense(random.Random(13))
+        'we might get a puppy'
     """
 
     def __init__(self, glove: Glove | None = None, max_words: int = 48) -> None:
@@ -204,10 +204,9 @@ def _loosely(name: str) -> list[list[str]]:
 
 @cache
 def training_words() -> tuple[str, ...]:
-    """All words of the commands to train on, those that say which way and how often first."""
-    parts = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
+    """All words of the commands to train on: those that say which way and how often, those of the templates, others."""
+    template = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
     used = {slot.strip("()").partition(":")[0] for name in KEYWORDS for slots in _loosely(name) for slot in slots}
-    for slot in used - {"before", "after"}:
-        parts.update(part.format(dir="", then="") for part in _spoken()["slots"][slot])
-    words = {word for part in parts for word in part.split()}
-    return tuple(sorted(words, key=lambda word: (word not in MEANINGFUL, word)))
+    loose = [part.format(dir="", then="") for slot in used - {"before", "after"} for part in _spoken()["slots"][slot]]
+    usual, others = ({word for part in parts for word in part.split()} for parts in (template, loose))
+    return tuple(sorted(usual | others, key=lambda word: (word not in MEANINGFUL, word not in usual, word)))

@@ -44,10 +44,7 @@ def filled(parts):
 def trained():
     parts = [part for file in read("templates").values() for slot in file["slots"].values() for part in slot["train"]]
     spoken = yaml.safe_load((resources.files("ldrl.language") / "spoken.yaml").read_text("utf-8"))
-    parts += [body for group in spoken["phrasings"] for body in group["bodies"]]
-    parts += [*spoken["corrections"], *spoken["confirmations"]]
-    talk = {f"{subject} {rest}" for group in spoken["talk"] for subject in group["subject"] for rest in group["rest"]}
-    return filled([*parts, *talk])
+    return filled([*parts, *(part for slot in spoken["slots"].values() for part in slot)])
 
 
 @pytest.fixture(scope="module")

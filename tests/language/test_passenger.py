@@ -1,6 +1,7 @@
 """What passengers say in training: it keeps its meaning, varies, and fits the tokenizer."""
 
 import random
+import re
 from collections import Counter
 from importlib import resources
 
@@ -16,6 +17,11 @@ DIRECTIONS = {"left", "right", "straight"}
 @pytest.fixture(scope="module")
 def spoken():
     return yaml.safe_load((resources.files("ldrl.language") / "spoken.yaml").read_text("utf-8"))
+
+
+def read_templates():
+    folder = resources.files("ldrl.language") / "templates"
+    return [yaml.safe_load(file.read_text("utf-8")) for file in folder.iterdir()]
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +61,34 @@ def test_clean_sentences_are_those_of_the_templates(passenger, monkeypatch):
 
 
 @pytest.mark.parametrize("name", KEYWORDS)
-def test_phrasings_name_the_directions_of_their_keyword(name, spoken):
-    keyword = KEYWORDS[name]
-    meant = {manoeuvre.name.lower() for manoeuvre in keyword.manoeuvres}
-    words = {"dir": keyword.manoeuvres[0].name.lower(), "then": keyword.manoeuvres[-1].name.lower()}
-    bodies = [body for group in spoken["phrasings"] if name in group["keywords"] for body in group["bodies"]]
-    assert len(bodies) >= 15
-    for body in bodies:
-        named = DIRECTIONS.intersection(word.removesuffix("s") for word in body.format(**words).split())
-        if "straight" in meant:  # it is also said as not turning, or of a turn as "right over"
-            named -= {"right", "left"} - meant
-            named.add("straight")
-        assert named == meant, body
+def test_loose_phrasings_name_the_directions_of_their_keyword(passenger, monkeypatch, name):
+    only(monkeypatch, CLEAN=1.0, LOOSE=1.0)
+    monkeypatch.setattr("ldrl.language.passenger.OPTIONAL", 0.0)
+    meant = {manoeuvre.name.lower() for manoeuvre in KEYWORDS[name].manoeuvres}
+    sentences = said(passenger, name, 500)
+    assert len(set(sentences)) > 80
+    for sentence in sentences:
+        named = DIRECTIONS.intersection(word.removesuffix("s") for word in sentence.split())
+        # Straight is also said as not turning, neither left nor right, and going on until a street comes.
+        assert "straight" in meant or named - {"straight"} == meant, sentence
+
+
+def test_slots_are_used_and_their_parts_clean(spoken):
+    slots = spoken["slots"]
+    used = {slot.strip("()").partition(":")[0] for group in spoken["groups"] for s in group["sentences"] for slot in s}
+    assert used | {"corrections", "confirmations", "fillers", "talk"} == slots.keys()
+    assert {name for group in spoken["groups"] for name in group["keywords"]} == KEYWORDS.keys()
+    for parts in slots.values():
+        assert len(set(parts)) == len(parts)
+        assert all(re.fullmatch(r"([a-z0-9{}]+ ?)+", part) for part in parts)
+
+
+def test_nothing_held_out_is_said(spoken):
+    heldout = {part for file in read_templates() for slot in file["slots"].values() for part in slot["heldout"]} - {""}
+    heldout = {part.replace("{then}", "{dir}") for part in heldout}
+    for part in (part.replace("{then}", "{dir}") for slot in spoken["slots"].values() for part in slot):
+        assert part not in heldout
+        assert not any(f" {other} " in f" {part} " for other in heldout if " " in other), part
 
 
 def test_what_says_which_way_survives_random_words(passenger, monkeypatch):
@@ -85,7 +107,7 @@ def test_what_says_which_way_survives_random_words(passenger, monkeypatch):
 
 def test_corrections_end_with_what_is_meant(passenger, monkeypatch, spoken):
     only(monkeypatch, CORRECTED=1.0)
-    markers = {tuple(marker.split()) for marker in spoken["corrections"]}
+    markers = {tuple(marker.split()) for marker in spoken["slots"]["corrections"]}
     for sentence in said(passenger, "left", 300):
         words = sentence.split()
         ends = [k + len(m) for m in markers for k in range(len(words)) if tuple(words[k : k + len(m)]) == m]
@@ -102,7 +124,9 @@ def test_talk_uses_direction_words_in_another_sense(passenger, monkeypatch):
 
 def test_repetitions_say_the_same_twice(passenger, monkeypatch):
     only(monkeypatch, REPEATED=1.0)
-    assert all(sentence.split().count("right") == 2 for sentence in said(passenger, "right", 50))
+    for words in map(str.split, said(passenger, "right", 50)):
+        again = [k for k in range(1, len(words) // 2 + 1) if words[:k] == words[-k:]]
+        assert any("right" in words[:k] for k in again), words
 
 
 def test_slips_change_a_letter_or_take_a_word_for_another(passenger, monkeypatch):
