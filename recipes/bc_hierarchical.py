@@ -178,10 +178,13 @@ def write_report(cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: 
     episodes = choose_episodes(cfg, towns)
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
         outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
+    batches = {stage: cfg[f"{stage}_steps"] for stage in cfg.stages}
+    if not isinstance(agent, HierarchicalAgent):
+        batches = {stage: cfg.drives_steps if stage == "high_level" else n for stage, n in batches.items()}
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
         "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations; "
-        + "; ".join(f"{stage}: {cfg[f'{stage}_steps']:,} batches" for stage in cfg.stages),
+        + "; ".join(f"{stage}: {count:,} batches" for stage, count in batches.items()),
         "Seed": str(cfg.seed),
         "Training": training,
         "Evaluation": f"{time.perf_counter() - began:.0f} s",

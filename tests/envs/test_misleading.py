@@ -101,11 +101,10 @@ def test_starts_and_ends(town, misleading):
     assert max(at_once) > 30
 
 
-def test_seeds_and_many_routes(town2, misleading, monkeypatch):
+def test_seeds_and_many_routes(town2, misleading):
     assert misleading_episodes(town2) == misleading["town2"]
     assert misleading_episodes(town2, seed=1) != misleading["town2"]
-    monkeypatch.setattr("ldrl.envs.misleading.MOST_ROUTES", 5)
-    drawn = misleading_episodes(town2)
+    drawn = misleading_episodes(town2, most_routes=5)
     assert set(Counter(episode.keyword for episode in drawn).values()) == {5}
     assert {e.id for e in drawn} < {e.id for e in misleading["town2"]}
 

@@ -122,13 +122,13 @@ def test_the_report_has_every_episode(trained, episodes):
 def test_losses_are_logged(trained):
     cwd, _ = trained
     logs = {path.stem: path for path in (cwd / "runs" / "brief" / "log").rglob("*.csv")}
-    assert {"loss_control", "loss_end_of_subtask", "loss_subtask"} <= set(logs)
-    for path in logs.values():
+    assert {"loss_keyword", "loss_control", "loss_end_of_subtask", "loss_subtask"} <= set(logs)
+    for name, path in logs.items():
         rows = list(csv.reader(path.open()))
-        assert [float(row[0]) for row in rows] == [0, 1]
+        assert [float(row[0]) for row in rows] == list(range(20 if "keyword" in name else 2))
         assert all(float(row[1]) >= 0 for row in rows)
     accuracies = [name for name in logs if "accuracy" in name]
-    assert len(accuracies) == 2  # of two networks, not mixed
+    assert len(accuracies) == 3  # of three stages, not mixed
 
 
 def test_evaluate_writes_its_json(trained, some, tmp_path):
@@ -138,7 +138,7 @@ def test_evaluate_writes_its_json(trained, some, tmp_path):
     assert done.returncode == 0, done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"mine.jsonl", "mine.json"}
     result = json.loads((tmp_path / "mine.json").read_text())
-    assert set(result) == {"summary", "episodes"}
+    assert set(result) == {"summary", "details", "episodes"}
     assert [record["id"] for record in result["episodes"]] == [episode.id for episode in some]
     for record, episode in zip(result["episodes"], some, strict=True):
         assert (record["town"], record["keyword"]) == (episode.town, episode.keyword)
@@ -162,7 +162,7 @@ def test_evaluate_prints_without_writing(trained, some, tmp_path, call):
 def test_evaluate_plans_episodes_on_a_map(trained, tmp_path, call, monkeypatch):
     cwd, _ = trained
     planned = iter(builtin_episodes(Town.load(MAP))[:3])
-    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town: list(planned))  # a few do
+    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town, split: list(planned))  # a few do
     printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", f"episodes={MAP}", "out=m.json", cwd=tmp_path)
     assert error in (None, 0)
     assert "theta.xodr" in printed
@@ -172,7 +172,7 @@ def test_evaluate_plans_episodes_on_a_map(trained, tmp_path, call, monkeypatch):
 
 def test_evaluate_says_that_a_map_has_no_junction(trained, tmp_path, call, monkeypatch):
     cwd, _ = trained
-    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town: [])
+    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town, split: [])
     _, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", f"episodes={MAP}", cwd=tmp_path)
     assert re.fullmatch(r"error: no keyword can be realised in .*theta\.xodr; give a map with junctions", error)
 
@@ -225,7 +225,10 @@ def test_broken_episode_files(trained, some, tmp_path, call, line, message):
         (["checkpoint=7"], "no checkpoint '7'"),
         (["checkpoint=cut"], "agent.safetensors is no complete safetensors file"),
         (["checkpoint=foreign"], "agent.json is no agent config"),
-        (["episodes=none.jsonl"], "there is no episode file 'none.jsonl'; give a JSON-lines file or 'builtin'"),
+        (
+            ["episodes=none.jsonl"],
+            "there is no episode file 'none.jsonl'; give a JSON-lines file, a map (.xodr) or one of builtin, ",
+        ),
         (["episodes=7"], "there is no episode file '7'"),
         (["episodes=none.xodr"], "there is no map 'none.xodr'; give an OpenDRIVE file"),
         (["out=no/such/folder.json"], "cannot write 'no/such/folder.json'"),
@@ -297,8 +300,8 @@ def test_every_config_key_is_read(recipe):
     if recipe == "bc_hierarchical":
         files += (RECIPES / "config" / "preset").glob("*.yaml")
     source = (RECIPES / f"{recipe}.py").read_text()
-    for title in re.findall(r'fit\(cfg, "(\w+)"', source):  # read as cfg[f"{title}_steps"]
-        source = source.replace('cfg[f"{title}_', f'cfg.{title}_steps cfg[f"{{title}}_')
+    for title in re.findall(r'fit\("(\w+)"', source):  # read as cfg[f"{title}_steps"]
+        source += f" cfg.{title}_steps"
     keys = {key for file in files for key in leaves(yaml.safe_load(file.read_text()))}
     assert keys
     unread = {key for key in keys if not re.search(rf"\bcfg\.{key}\b", source)}
