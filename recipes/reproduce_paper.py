@@ -4,7 +4,7 @@
     python recipes/reproduce_paper.py seeds=[0,1,2]         # all three
     python recipes/reproduce_paper.py tables=[models]       # only what one table needs
     python recipes/reproduce_paper.py tables=[]             # only write the page again
-    python recipes/reproduce_paper.py preset=smoke          # everything in little, to see it run
+    python recipes/reproduce_paper.py scale=smoke           # everything in little, to see it run
 
 A cell is one training with its evaluation, or one evaluation, done by a command that one may also type; which ones
 there are is said in config/reproduce_paper.yaml. Cells go to runs/paper/seed<k>/<cell>/, with what they print in
@@ -99,7 +99,7 @@ class Cell:
 
 def make_cells(cfg: DictConfig) -> list[Cell]:
     """The cells that the tables need, for every seed."""
-    table, settings = OmegaConf.to_container(cfg.cells), cfg.presets[cfg.preset]
+    table, settings = OmegaConf.to_container(cfg.cells), cfg.scales[cfg.scale]
     wanted = [cell for title in cfg.tables for cell in cfg.contents[title]]
     for name in wanted:  # grows on the way
         wanted += [needed for needed in needs(table[name]) if needed not in wanted]
@@ -115,7 +115,7 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
             else:
                 recipe = "bc_hierarchical.py"
                 taken_from = {"start_from": taken} if taken else {}
-                own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.preset}
+                own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 given = own | given | taken_from
             cells.append(Cell(folder / name, recipe, tuple(argument(*item) for item in given.items()), taken))
     return cells
@@ -197,7 +197,7 @@ def close(ended: Running, hardware: str) -> bool:
 
 def write_page(cfg: DictConfig) -> Path:
     """Add the finished cells to the results and write the page of all."""
-    settings = cfg.presets[cfg.preset]
+    settings = cfg.scales[cfg.scale]
     page = Path(settings.page)
     page.parent.mkdir(parents=True, exist_ok=True)
     results = Results([*Results.load(page.with_suffix(".json")), *read_cells(Path("runs") / settings.name)])
@@ -213,7 +213,7 @@ def check(cfg: DictConfig) -> None:
     for name in ("tables", "seeds"):
         if not OmegaConf.is_list(cfg[name]):
             raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
-    for name, given, known in (("tables", cfg.tables, cfg.contents), ("preset", [cfg.preset], cfg.presets)):
+    for name, given, known in (("tables", cfg.tables, cfg.contents), ("scale", [cfg.scale], cfg.scales)):
         unknown = [value for value in given if value not in known]
         if unknown:
             raise ValueError(f"{name} has {unknown[0]!r}; use some of {', '.join(known)}")
