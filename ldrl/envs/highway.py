@@ -202,7 +202,7 @@ def check(config: Mapping[str, Any]) -> None:
         raise ValueError(f"town is {config['town']!r}; give a Town or the name of one")
     if not isinstance(config["episode"], Episode | Mapping | None):
         raise ValueError(f"episode is {config['episode']!r}; give an Episode, a dictionary of its fields, or None")
-    if isinstance(config["episode"], Mapping) and set(config["episode"]) != set(FIELDS):
+    if isinstance(config["episode"], Mapping) and set(config["episode"]) - {"stop"} != set(FIELDS):
         raise ValueError(f"episode has {', '.join(map(str, config['episode']))}; an episode has {', '.join(FIELDS)}")
     for name, least in (("vehicles_count", 0), ("max_steps", 1)):
         if type(config[name]) is not int or config[name] < least:

@@ -90,13 +90,12 @@ def test_an_unknown_split_is_refused(town2):
         builtin_episodes(town2, "test")
 
 
-def test_of_many_routes_some_are_drawn(town2, episodes, monkeypatch):
-    monkeypatch.setattr("ldrl.envs.episodes.MOST_ROUTES", 5)
-    drawn, other = builtin_episodes(town2), builtin_episodes(town2, seed=1)
+def test_of_many_routes_some_are_drawn(town2, episodes):
+    drawn, other = builtin_episodes(town2, most_routes=5), builtin_episodes(town2, seed=1, most_routes=5)
     routes = {episode.id: episode.route(town2).lanes for episode in episodes["town2"]}
     assert set(Counter(episode.keyword for episode in drawn).values()) == {5}
     assert all(episode.route(town2).lanes == routes[episode.id] for episode in drawn)
-    assert builtin_episodes(town2) == drawn
+    assert builtin_episodes(town2, most_routes=5) == drawn
     assert {episode.id for episode in other} != {episode.id for episode in drawn}
 
 
