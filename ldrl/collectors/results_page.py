@@ -179,7 +179,7 @@ def _shortfalls(results: Results, segmenter: Mapping[str, Any]) -> Iterator[str]
 
 
 def _families(results: Results) -> str:
-    lines = [
+    lines: list[Sequence[str]] = [
         ("sentences", *(f"{TOWNS[t]} {m}" for t in ("town1", "town2") for m in ("success", "strict success", "kept")))
     ]
     for family, cell in ({"clean": "gs-hih"} | FAMILIES).items():
@@ -193,7 +193,7 @@ def _families(results: Results) -> str:
 
 
 def _unseen(results: Results) -> str:
-    lines = [("type", "episodes", "success", "strict success")]
+    lines: list[Sequence[str]] = [("type", "episodes", "success", "strict success")]
     for type_ in (*TYPES, T_ONLY, FOUR_WAY, "worst town"):
         episodes = results.values("gs-hih-unseen", "unseen", type_, "episodes")
         rates = [results.values("gs-hih-unseen", "unseen", type_, m) for m in ("success", "strict_success")]

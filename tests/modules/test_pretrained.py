@@ -8,7 +8,6 @@ from ldrl.collectors import evaluate
 from ldrl.language import KEYWORDS
 from ldrl.modules import PRETRAINED, HierarchicalAgent, resolve_checkpoint
 
-
 MODALITIES = ("gs", "ps", "rgb")
 
 
@@ -18,7 +17,7 @@ def agents():
 
 
 def test_ship_with_their_reports_and_are_small():
-    assert PRETRAINED == tuple(f"hierarchical-{modality}" for modality in MODALITIES)
+    assert tuple(f"hierarchical-{modality}" for modality in MODALITIES) == PRETRAINED
     sizes = 0
     for name in PRETRAINED:
         files = {file.name: file.stat().st_size for file in resolve_checkpoint(name).iterdir()}
