@@ -38,8 +38,10 @@ from ldrl.collectors.report import replacing
 from ldrl.collectors.results import MADE, REPORT, Results, read_cells
 from ldrl.collectors.results_page import results_page
 from ldrl.envs.segmenter import SHIPPED
+from ldrl.modules.checkpoint import WEIGHTS
 
 RECIPES = Path(__file__).parent
+TRAINING, EVALUATION = "bc_hierarchical.py", "evaluate.py"
 OUTPUT = "output.txt"
 TAIL = 15
 """Lines of a failed cell's output that are shown."""
@@ -68,7 +70,7 @@ class Cell:
 
     def origin(self) -> dict[str, Any]:
         """What it is made from: if this has changed, so has the cell."""
-        weights = (folder / "agent.safetensors" for folder in self.needs)
+        weights = (folder / WEIGHTS for folder in self.needs)
         return {
             "command": shlex.join(("python", f"recipes/{self.recipe}", *self.arguments)),
             "weights": [hashlib.sha256(file.read_bytes()).hexdigest()[:16] for file in weights],
@@ -76,7 +78,8 @@ class Cell:
 
     def finished(self) -> bool:
         """Whether nothing is to be done; cells that it needs must be finished."""
-        if not (self.folder / MADE).is_file() or not (self.folder / REPORT).is_file():
+        weights = [WEIGHTS] if self.recipe == TRAINING else []
+        if not all((self.folder / file).is_file() for file in (MADE, REPORT, *weights)):
             return False
         made = json.loads((self.folder / MADE).read_text(encoding="utf-8"))
         changed = [what for what, value in self.origin().items() if made[what] != value]
@@ -110,10 +113,10 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
             given = dict(table[name])
             taken = tuple(folder / needed for needed in needs(given))
             if "checkpoint" in given:
-                recipe = "evaluate.py"
+                recipe = EVALUATION
                 given |= {"checkpoint": taken[0], "out": folder / name / REPORT, **settings.evaluation}
             else:
-                recipe = "bc_hierarchical.py"
+                recipe = TRAINING
                 taken_from = {"start_from": taken} if taken else {}
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 given = own | given | taken_from

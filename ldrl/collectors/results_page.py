@@ -43,7 +43,7 @@ INTRODUCTION = """\
 # Results
 
 The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_paper.py` writes this page from
-`results.json` beside it and from the finished cells of `runs/paper`; nothing here is typed by hand.
+`results.json` beside it and from the finished cells of `runs/paper`; a change by hand is lost.
 
 - *success*, the paper's measure: no collision, and every point of the path within 10 m of the track. *strict success*:
   also never off the road, never in an oncoming lane, and `finish` declared within 15 m of the path's end. *paper*: what
@@ -61,15 +61,16 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
    in another proportion in `all`.
 3. **Sentences** come from our own templates on the paper's scale, and evaluation says held-out ones only: harder than
    the paper's, whose templates are the same in both.
-4. **Sizes and schedule.** Networks of 0.8 million parameters, trained in minutes on two CPU cores.
-5. **The reader is learned first**, from sentences alone, and then stays as it is: sentences are cheap and images are
-   not. All models but NMC, which lacks the attention, share it.
+4. **Sizes and schedule.** Networks of 0.9 million parameters, trained in minutes on two CPU cores.
+5. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,
+   images are not. It reads both ways. All models but NMC, which lacks the attention, share it.
 6. **Models share the low level** of Hih where the paper's differ in the high level only.
-7. **rgb and ps start from the agent on gs**, the same road in other colours, which saves most of their training. H0's
-   high level sees no image, so that on rgb and ps it is that of gs.
-8. **rgb is normalised by the colour of the road in front of the car and trained in looks drawn for every image**;
-   the table of looks shows what the latter is worth.
-9. **ps** comes from a small DeepLabv3+ of our own, trained on random towns: no public weights know these images.
+7. **Training on rgb starts from the agent on gs**: the same road in other colours, which saves most of it. **ps is not
+   trained on**: agents trained on gs drive on it as they are. H0's high level sees no image, so that on rgb and ps it
+   is that of gs.
+8. **Colours are seen relative to the road in front of the car and to the image's contrast, and looks are drawn for
+   every image of the training**; the table of looks shows what the latter is worth.
+9. **The segmenter of ps** is a small DeepLabv3+ trained on random towns of ours, the paper's on photographs.
 10. **Views beside the path** are labelled by asking the expert there, where the paper shifts the steering of turned
     cameras by a constant: recovery is learned exactly.
 11. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step.
@@ -115,11 +116,11 @@ def results_page(results: Results, cells: Sequence[str], segmenter: Mapping[str,
     return "\n\n".join(parts) + "\n"
 
 
-def _spread(values: Sequence[float]) -> str:
+def _spread(values: Sequence[float], digits: int = 3) -> str:
     if not values:
         return "-"
-    least, largest = min(values), max(values)
-    return f"{mean(values):.3f}" + (f" ({least:.3f} to {largest:.3f})" if len(values) > 1 else "")
+    spread = f" ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else ""
+    return f"{mean(values):.{digits}f}{spread}"
 
 
 def _table(results: Results, what: str, rows: Mapping[str, str], types: Sequence[str]) -> str:
@@ -179,21 +180,21 @@ def _shortfalls(results: Results, segmenter: Mapping[str, Any]) -> Iterator[str]
 
 
 def _families(results: Results) -> str:
-    lines: list[Sequence[str]] = [
+    lines = [
         ("sentences", *(f"{TOWNS[t]} {m}" for t in ("town1", "town2") for m in ("success", "strict success", "kept")))
     ]
     for family, cell in ({"clean": "gs-hih"} | FAMILIES).items():
-        line = [family]
+        figures = []
         for town in ("town1", "town2"):
-            line += [_spread(results.values(cell, town, "all", m)) for m in ("success", "strict_success")]
-            line.append(_spread(results.values(cell, town, "all", "kept")) if cell != "gs-hih" else "-")
-        lines.append(line)
+            figures += [_spread(results.values(cell, town, "all", m)) for m in ("success", "strict_success")]
+            figures.append(_spread(results.values(cell, town, "all", "kept")) if cell != "gs-hih" else "-")
+        lines.append((family, *figures))
     table = markdown_table(lines, left=1)
     return f"{table}\n\nThe same routes in other sentences; *kept* is success as a share of that on clean sentences."
 
 
 def _unseen(results: Results) -> str:
-    lines: list[Sequence[str]] = [("type", "episodes", "success", "strict success")]
+    lines: list[tuple[str, ...]] = [("type", "episodes", "success", "strict success")]
     for type_ in (*TYPES, T_ONLY, FOUR_WAY, "worst town"):
         episodes = results.values("gs-hih-unseen", "unseen", type_, "episodes")
         rates = [results.values("gs-hih-unseen", "unseen", type_, m) for m in ("success", "strict_success")]
@@ -216,19 +217,19 @@ def _segmenter(report: Mapping[str, Any]) -> str:
 def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:
     known = [result for result in results if result.cell in cells]
     for seed in results.seeds:
-        own = [result for result in known if result.seed == seed]
-        clock, added = _busy(own) / 60, sum(result.seconds for result in own) / 60
-        yield f"Seed {seed}: {len(own)} of {len(cells)} cells, {clock:.0f} minutes by the clock, {added:.0f} of cells."
+        timed = [result for result in known if result.seed == seed and result.began]
+        clock, added = (f"{seconds / 60:.0f}" for seconds in (_busy(timed), sum(result.seconds for result in timed)))
+        yield f"Seed {seed}: {len(timed)} of {len(cells)} cells took {clock} minutes by the clock, {added} added up."
     for what in ("hardware", "versions"):
         yield f"{what.capitalize()}: {'; '.join(sorted({getattr(result, what) for result in known})) or '-'}."
-    lines = [("cell", "minutes", "seeds", "command of the latest")]
+    lines, commands = [("cell", "minutes", "seeds")], []
     for cell in cells:
         made = results.of(cell)
-        minutes = [result.seconds / 60 for result in made]
-        spread = f"{mean(minutes):.1f} ({min(minutes):.1f} to {max(minutes):.1f})" if made else "-"
-        command = max(made, key=lambda result: result.began).command if made else "-"
-        lines.append((cell, spread, str(len(made)), command))
+        lines.append((cell, _spread([result.seconds / 60 for result in made if result.began], 1), str(len(made))))
+        commands += [result.command for result in made]
     yield markdown_table(lines, left=1)
+    yield 'A "-" with a seed is a cell whose command was typed by hand, which nobody timed. The commands:'
+    yield "\n".join(("```", *commands, "```"))
 
 
 def _busy(results: Sequence[Result]) -> float:

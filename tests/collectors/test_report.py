@@ -11,6 +11,7 @@ from ldrl.collectors.report import (
     PAPER,
     PAPER_MISLEADING,
     check_writable,
+    keyword_table,
     replacing,
     summarise,
     table,
@@ -237,3 +238,10 @@ def test_hostile_texts_stay_in_their_cells():
     assert "# a # b" in text
     assert max(map(len, text.splitlines())) < 400
     assert cells(text, "seed") == [r"0\|1"]
+
+
+def test_many_towns_are_taken_together():
+    some = [outcome(str(k), f"random-{k}", success=k > 0, strict=k > 1) for k in range(5)]
+    assert cells(table(some[:4]), "random-3", "all")[:3] == ["1", "1.000", "1.000"]
+    assert cells(table(some), "5 towns", "all")[:3] == ["5", "0.800", "0.600"]
+    assert "5 towns success" in keyword_table(some)

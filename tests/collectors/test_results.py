@@ -161,15 +161,18 @@ def test_targets_are_judged_by_the_mean():
 
 
 def test_time_by_the_clock_by_hand():
-    three = [
-        result("gs-hih", 0, began=0.0, seconds=600.0),
-        result("gs-hi", 0, began=300.0, seconds=600.0, command="python x.py 'stages=[high_level]'"),
-        result("gs-h0", 0, began=3000.0, seconds=60.0),
+    some = [
+        result("gs-hih", 0, began=1000.0, seconds=600.0),
+        result("gs-hi", 0, began=1300.0, seconds=600.0, command="python x.py 'stages=[high_level]'"),
+        result("gs-h0", 0, began=4000.0, seconds=60.0),
+        result("gs-nmc", 0, began=0, seconds=999.0),  # by hand
     ]
-    text = section(results_page(Results(three), ["gs-hih", "gs-hi", "gs-h0", "rgb-h0"], SEGMENTER), "Time")
-    assert "Seed 0: 3 of 4 cells, 16 minutes by the clock, 21 of cells." in text
-    assert row(text, "gs-hi")[1:3] == ["10.0 (10.0 to 10.0)", "1"]
-    assert row(text, "rgb-h0")[1:] == ["-", "0", "-"]
+    text = section(results_page(Results(some), ["gs-hih", "gs-hi", "gs-h0", "gs-nmc", "rgb-h0"], SEGMENTER), "Time")
+    assert "Seed 0: 3 of 5 cells took 16 minutes by the clock, 21 added up." in text
+    assert row(text, "gs-hi")[1:] == ["10.0", "1"]
+    assert row(text, "gs-nmc")[1:] == ["-", "1"]
+    assert row(text, "rgb-h0")[1:] == ["-", "0"]
+    assert "\npython x.py 'stages=[high_level]'\n" in text
 
 
 def test_the_paper_is_worse_in_the_other_town_only_where_it_says_so():

@@ -15,12 +15,13 @@ from hydra.core.global_hydra import GlobalHydra
 
 from ldrl.envs import builtin_episodes, save_episodes
 from ldrl.language import KEYWORDS
-from ldrl.modules import AgentConfig, load_agent
+from ldrl.modules import AgentConfig, load_agent, make_agent, save_agent
 from ldrl.towns import Town
 
 MAP = Path(__file__).parents[1] / "towns" / "theta.xodr"
 RECIPES = Path(__file__).parents[2] / "recipes"
 TINY = ("size.conv_channels=[2,3,4]", "size.features=8", "size.low_level_hidden=6", "size.high_level_hidden=7")
+TOWNS = ("town1", "town2")
 BRIEF = ("preset=smoke", "low_level_steps=2", "high_level_steps=2", "batch_slices=4", "batch_sequences=4")
 
 
@@ -177,6 +178,32 @@ def test_evaluate_says_that_a_map_has_no_junction(trained, tmp_path, call, monke
     assert re.fullmatch(r"error: no keyword can be realised in .*theta\.xodr; give a map with junctions", error)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "asked"),
+    [
+        (["episodes=builtin"], [("town1", "heldout", {}), ("town2", "heldout", {})]),
+        (["episodes=noise"], [("town1", "noise", {}), ("town2", "noise", {})]),
+        (["episodes=misleading", "routes_per_keyword=3"], [(k, "misleading", {"most_routes": 3}) for k in TOWNS]),
+        (["episodes=unseen", "unseen_towns=2"], [(k, "heldout", {"most_routes": 2}) for k in ("town1", "town2")]),
+    ],
+)
+def test_evaluate_plans_what_is_asked_for(trained, episodes, towns, tmp_path, call, monkeypatch, arguments, asked):
+    cwd, _ = trained
+    found = []
+
+    def plan(town, split="misleading", **settings):
+        found.append((town.name, split, settings))
+        return [min(episodes[town.name], key=lambda e: len(e.path))]
+
+    monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town, split="heldout", **most: plan(town, split, **most))
+    monkeypatch.setattr("ldrl.envs.misleading_episodes", plan)
+    monkeypatch.setattr("ldrl.towns.random_town", lambda k: towns[TOWNS[k]])
+    printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", "appearance=rain", *arguments, cwd=tmp_path)
+    assert error in (None, 0)
+    assert found == asked
+    assert "100%" in printed
+
+
 def test_odd_instructions_are_no_errors(trained, some, tmp_path, call):
     cwd, _ = trained
     odd = ["word " * 5000, "zzyzzyx qwrtz", "🚗 ⬅️", "Links abbiegen!"]
@@ -234,6 +261,9 @@ def test_broken_episode_files(trained, some, tmp_path, call, line, message):
         (["out=no/such/folder.json"], "cannot write 'no/such/folder.json'"),
         (["out=cut"], "cannot write 'cut'"),
         (["num_cars=0"], "num_cars is 0; give at least 1"),
+        (["episodes=unseen", "unseen_towns=0"], "unseen_towns is 0; give at least 1"),
+        (["routes_per_keyword=0"], "routes_per_keyword is 0; give at least 1"),
+        (["appearance=hail"], "weather 'hail' is unknown; use one of clear"),
         (["device=moon"], "moon"),
     ],
 )
@@ -288,6 +318,22 @@ def test_unknown_presets_are_named(tmp_path, call):
     assert "preset/atlantis" in printed
     assert re.search(r"default\s+smoke", printed)
     assert not list(tmp_path.iterdir())
+
+
+def test_each_part_is_taken_from_the_first_checkpoint_that_has_it(tmp_path):
+    start_from = runpy.run_path(str(RECIPES / "bc_hierarchical.py"), run_name="recipe")["start_from"]
+    small = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "high_level_hidden": 7}
+    for name, model, modality in (("gs-h0", "h0", "gs"), ("rgb-hih", "hih", "rgb"), ("ps-hih", "hih", "ps")):
+        save_agent(make_agent(AgentConfig(model=model, modality=modality, **small)), tmp_path / name)
+    for modality in ("rgb", "ps"):
+        low, high = tmp_path / f"{modality}-hih", tmp_path / "gs-h0"
+        agent = make_agent(AgentConfig(model="h0", modality=modality, **small))
+        copied = start_from(agent, [str(low), str(high)])
+        assert sorted(copied) == ["control", "end_of_subtask", "high_level"]  # whole, though parts of others fit too
+        for part, checkpoint in (("control", low), ("end_of_subtask", low), ("high_level", high)):
+            theirs = getattr(load_agent(checkpoint), part).state_dict()
+            ours = getattr(agent, part).state_dict()
+            assert all(ours[key].equal(value) for key, value in theirs.items())
 
 
 def leaves(values):
