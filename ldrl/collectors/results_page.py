@@ -55,12 +55,11 @@ The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_p
 DEPARTURES = """\
 These concern the tables above; [the design](design.md#departures-from-the-paper) has all, with reasons.
 
-1. **World.** A flat town drawn from its lanes instead of CARLA, whose towns it cannot show: the paper's rgb looks
-   otherwise than ours, so that its rgb column says how hard CARLA's images are, too.
-2. **Episodes** are all routes of our planner, not the paper's 159 and 142, which are not published; so types are mixed
-   in another proportion in `all`.
-3. **Sentences** come from our own templates on the paper's scale, and evaluation says held-out ones only: harder than
-   the paper's, whose templates are the same in both.
+1. **World.** Flat towns drawn from their lanes instead of CARLA. On rgb the figures compare worlds as well as agents:
+   CARLA's images are other ones than ours, and nobody has driven either agent in the other's.
+2. **Episodes** are all routes of our planner, not the paper's 159 and 142, so that `all` mixes the types in another
+   proportion.
+3. **Sentences** come from our own templates on the paper's scale; evaluation says held-out ones only.
 4. **Sizes and schedule.** Networks of 0.9 million parameters, trained in minutes on two CPU cores.
 5. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,
    images are not. It reads both ways. All models but NMC, which lacks the attention, share it.
@@ -200,7 +199,9 @@ def _unseen(results: Results) -> str:
         rates = [results.values("gs-hih-unseen", "unseen", type_, m) for m in ("success", "strict_success")]
         lines.append((type_, f"{mean(episodes):.0f}" if episodes else "-", *map(_spread, rates)))
     table = markdown_table(lines, left=1)
-    return f"Random towns 0 to 49, in which nothing was trained; two routes of every keyword in each.\n\n{table}"
+    return (
+        f"Random towns from number 0 on, in which no agent was trained; two routes of every keyword in each.\n\n{table}"
+    )
 
 
 def _segmenter(report: Mapping[str, Any]) -> str:
