@@ -26,7 +26,7 @@ import ldrl  # noqa: F401  (it registers the Gymnasium environments)
 from ldrl import keys
 from ldrl.envs import DashCamera, TownEnv, vehicle
 from ldrl.subtasks import SubTask
-from ldrl.towns import Town, random_town
+from ldrl.towns import Town
 
 BATCHES = (1, 16, 64, 256, 1024)
 WORLDS = 64
@@ -116,7 +116,7 @@ def with_camera(env: TownEnv, modality: str = "gs") -> TransformedEnv:
 
 def rows(device: str) -> list[Row]:
     """All rows; one that others are compared with comes before them."""
-    town1, large = Town.load("town1"), random_town(0, blocks=90)
+    town1, large = Town.load("town1"), Town.load("random-0-90")
     crowded, gs, stock_road = (
         f"highway-env, {TRAFFIC} IDM cars",
         "TownEnv, gs",

@@ -18,13 +18,14 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer as Buffer
 from torchrl.data.replay_buffers import Sampler
 from torchrl.envs import Compose, DeviceCastTransform, Transform
 from torchrl.objectives import LossModule
@@ -56,17 +57,25 @@ class Training:
     """The stages of a training, each a buffer and losses."""
 
     def __init__(self, cfg: DictConfig, agent: Agent, folder: Path) -> None:
-        self.cfg, self.agent = cfg, agent
-        self.town = Town.load(cfg.town)
+        self.cfg, self.agent, self.folder = cfg, agent, folder
+        self.policy = agent.high_level if isinstance(agent, HierarchicalAgent) else agent.policy
+        self.towns = [Town.load(name) for name in cfg.towns]
         shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
         self.logger = CSVLogger("log", str(folder))
         self.history: dict[str, list[float]] = {}
-        path = folder / "demonstrations"
-        self.demonstrations = collect_demonstrations(self.town, cfg.demonstration_frames, path=path, seed=cfg.seed)
-        self.policy = agent.high_level if isinstance(agent, HierarchicalAgent) else agent.policy
 
-    def fit(self, title: str, losses: Sequence[LossModule], buffer: TensorDictReplayBuffer, rows: int) -> None:
-        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences."""
+    @cached_property
+    def driven(self) -> list[tuple[Town, Buffer, int]]:
+        """Towns, the demonstrations there and seeds for what is drawn from them."""
+        driven = []
+        for k, town in enumerate(tqdm(self.towns, "demonstrations", unit="town")):
+            path = self.folder / "demonstrations" / town.name
+            demonstrations = collect_demonstrations(town, self.cfg.demonstration_frames, path=path, seed=self.cfg.seed)
+            driven.append((town, demonstrations, 100 * self.cfg.seed + k))
+        return driven
+
+    def fit(self, title: str, losses: Sequence[LossModule], buffers: Sequence[Buffer], rows: int) -> None:
+        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences, from each buffer in turn."""
         parameters = [p for loss in losses for p in loss.parameters() if p.requires_grad]
         steps = self.cfg[f"{title}_steps"]
         optimizer = torch.optim.Adam(parameters)
@@ -75,7 +84,7 @@ class Training:
         history: dict[str, list[float]] = defaultdict(list)
         bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
         for step in bar:
-            batch = buffer.sample().reshape(rows, -1).to(self.cfg.device)
+            batch = buffers[step % len(buffers)].sample().reshape(rows, -1).to(self.cfg.device)
             outputs = [loss(batch) for loss in losses]
             sum(value for output in outputs for name, value in output.items() if name.startswith("loss_")).backward()
             torch.nn.utils.clip_grad_norm_(parameters, self.cfg.max_grad_norm)
@@ -89,29 +98,30 @@ class Training:
                 self.logger.log_scalar(name, value, step)
         self.history |= history
 
-    def view(self, sampler: Sampler, frames: int, length: int, **disturbed: float) -> TensorDictReplayBuffer:
-        """A buffer over the demonstrations that draws their images, seen from disturbed poses, when sampled."""
-        cfg = self.cfg
-        transforms: list[Transform] = [DisturbedView(self.town, length, seed=cfg.seed, **disturbed)]
-        transforms.append(DeviceCastTransform(cfg.device))
-        if isinstance(sampler, SnippetSampler) or keys.IMAGE in self.policy.in_keys:
-            camera = make_camera(self.town, cfg.modality, appearance=cfg.appearance, seed=cfg.seed).to(cfg.device)
-            transforms.append(camera if isinstance(sampler, SnippetSampler) else OncePerFrame(camera))
-        return TensorDictReplayBuffer(
-            storage=self.demonstrations.storage, sampler=sampler, batch_size=frames, transform=Compose(*transforms)
-        )
+    def views(self, samplers: Sequence[Sampler], frames: int, length: int, **disturbed: float) -> list[Buffer]:
+        """For each town a buffer over its demonstrations that draws images, seen from disturbed poses, when sampled."""
+        cfg, buffers = self.cfg, []
+        for (town, demonstrations, seed), sampler in zip(self.driven, samplers, strict=True):
+            transforms: list[Transform] = [DisturbedView(town, length, seed=seed, **disturbed)]
+            transforms.append(DeviceCastTransform(cfg.device))
+            if isinstance(sampler, SnippetSampler) or keys.IMAGE in self.policy.in_keys:
+                camera = make_camera(town, cfg.modality, appearance=cfg.appearance, seed=seed).to(cfg.device)
+                transforms.append(camera if isinstance(sampler, SnippetSampler) else OncePerFrame(camera))
+            shown = {"batch_size": frames, "transform": Compose(*transforms)}
+            buffers.append(Buffer(storage=demonstrations.storage, sampler=sampler, **shown))
+        return buffers
 
     def language(self) -> None:
         """Learn to read: what sentences mean. The words' encoder then stays as it is."""
         cfg = self.cfg
         sentences = collect_sentences(cfg.sentences, cfg.batch_sentences, seed=cfg.seed)
-        self.fit("language", [KeywordLoss(self.policy)], sentences, cfg.batch_sentences)
+        self.fit("language", [KeywordLoss(self.policy)], [sentences], cfg.batch_sentences)
 
     def low_level(self) -> None:
         """Learn to steer and give gas, and to see where a sub-task ends."""
         cfg = self.cfg
-        sampler = SnippetSampler(self.demonstrations, cfg.slice_length, seed=cfg.seed)
-        slices = self.view(sampler, cfg.batch_slices * cfg.slice_length, cfg.slice_length)
+        samplers = [SnippetSampler(drives, cfg.slice_length, seed=seed) for _, drives, seed in self.driven]
+        slices = self.views(samplers, cfg.batch_slices * cfg.slice_length, cfg.slice_length)
         losses = [ControlLoss(self.agent.control), EndOfSubtaskLoss(self.agent.end_of_subtask)]
         self.fit("low_level", losses, slices, cfg.batch_slices)
 
@@ -120,15 +130,16 @@ class Training:
         cfg = self.cfg
         encoder: nn.Module = self.policy.reader[0]
         encoder.requires_grad_(False)
-        settings = {"misleading": cfg.misleading, "seed": cfg.seed}
         if isinstance(self.agent, HierarchicalAgent):
-            sampler = BoundarySampler(self.demonstrations, self.town, **settings)
-            frames = cfg.batch_sequences * sampler.decisions
-            decisions = self.view(sampler, frames, 1, lateral=0.3, yaw=0.1)
+            settings = {"misleading": cfg.misleading}
+            samplers = [BoundarySampler(drives, town, seed=seed, **settings) for town, drives, seed in self.driven]
+            frames = cfg.batch_sequences * samplers[0].decisions
+            decisions = self.views(samplers, frames, 1, lateral=0.3, yaw=0.1)
             self.fit("high_level", [SubtaskLoss(self.policy)], decisions, cfg.batch_sequences)
         else:
-            sampler = DriveSampler(self.demonstrations, self.town, cfg.drive_length, **settings)
-            drives = self.view(sampler, cfg.batch_drives * cfg.drive_length, cfg.drive_length)
+            length = cfg.drive_length
+            samplers = [DriveSampler(drives, town, length, seed=seed) for town, drives, seed in self.driven]
+            drives = self.views(samplers, cfg.batch_drives * length, length)
             self.fit("drives", [SinglePolicyLoss(self.policy)], drives, cfg.batch_drives)
         encoder.requires_grad_(True)
 
@@ -209,7 +220,7 @@ def main(cfg: DictConfig) -> None:
         unknown = set(cfg.stages) - set(STAGES)
         if unknown:
             raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
-        towns = {town.name: town for town in map(Town.load, (cfg.town, cfg.test_town))}
+        towns = {town.name: town for town in map(Town.load, cfg.test_towns)}
         sizes = OmegaConf.to_container(cfg.size)
         if cfg.misleading and not MODELS[cfg.model].hierarchical:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
@@ -217,13 +228,13 @@ def main(cfg: DictConfig) -> None:
         if cfg.start_from:
             copied = start_from(agent, [str(checkpoint) for checkpoint in cfg.start_from])
             print(f"Taken from {', '.join(cfg.start_from)}: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
     except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
 
     began = time.perf_counter()
-    training = Training(cfg, agent, folder)
     for stage in STAGES:
         if stage in cfg.stages and not (stage == "low_level" and not isinstance(agent, HierarchicalAgent)):
             getattr(training, stage)()

@@ -29,7 +29,7 @@ from ldrl.collectors.report import PAPER, PAPER_MISLEADING, check_writable, keyw
 from ldrl.envs import DashCamera, Episode, builtin_episodes, load_episodes, misleading_episodes
 from ldrl.language import Family
 from ldrl.modules import load_agent
-from ldrl.towns import LAYOUTS, Town, random_town
+from ldrl.towns import LAYOUTS, Town
 
 FAMILIES = get_args(Family)
 SETS = ("builtin", *FAMILIES, "misleading", "unseen")
@@ -41,7 +41,7 @@ def choose_episodes(cfg: DictConfig) -> Iterator[tuple[dict[str, Town], list[Epi
     most = {} if cfg.routes_per_keyword is None else {"most_routes": cfg.routes_per_keyword}
     if source == "unseen":
         for k in range(cfg.unseen_towns):
-            town = random_town(k)
+            town = Town.load(f"random-{k}")
             yield {town.name: town}, builtin_episodes(town, **({"most_routes": 2} | most))
     elif source in SETS or source.endswith(".xodr"):
         for town in map(Town.load, LAYOUTS if source in SETS else [source]):

@@ -30,7 +30,7 @@ from ldrl.envs import DashCamera, RoadSegmenter
 from ldrl.envs.appearance import WEATHERS
 from ldrl.envs.camera import shift
 from ldrl.envs.image_format import PREPROCESSING, ImageFormat
-from ldrl.towns import Town, random_town
+from ldrl.towns import Town
 
 BESIDE, TURNED = 0.8, 0.2
 """Standard deviations of the views from a lane's centre (m) and direction (rad), cut at three of them."""
@@ -180,7 +180,7 @@ def main(cfg: DictConfig) -> None:
         sys.exit(f"error: {error}")
     began = time.perf_counter()
     image_format = ImageFormat(size=tuple(cfg.size), first_row=cfg.first_row)
-    towns = (random_town(cfg.first_town + k) for k in range(cfg.towns))
+    towns = (Town.load(f"random-{cfg.first_town + k}") for k in range(cfg.towns))
     views = [
         Views(town, "sample", 0.5, cfg.seed + k, cfg.device)
         for k, town in enumerate(tqdm(towns, "towns", cfg.towns, unit="town"))

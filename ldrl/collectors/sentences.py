@@ -6,10 +6,11 @@ import random
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from ldrl import keys
-from ldrl.language import KEYWORDS, Passenger, Tokenizer
+from ldrl.collectors.demonstrations import TRAJECTORY
+from ldrl.language import KEYWORDS, PADDING, Passenger, Tokenizer
 
 __all__ = ["collect_sentences"]
 
@@ -21,6 +22,9 @@ def collect_sentences(
     count: int, batch_size: int, tokenizer: Tokenizer | None = None, seed: int = 0
 ) -> TensorDictReplayBuffer:
     """What passengers say, as many sentences of each keyword, and some that ask for nothing.
+
+    A sample holds sentences of about the same length, so that little is padding: they are stored from short to long,
+    as one trajectory that slices are taken from.
 
     Args:
         count: how many sentences.
@@ -42,11 +46,12 @@ def collect_sentences(
         sentences.append(passenger.say(list(KEYWORDS)[keyword], rng) if known else passenger.nonsense(rng))
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(count),
-        sampler=RandomSampler(),
+        sampler=SliceSampler(num_slices=1, traj_key=TRAJECTORY, truncated_key=None, cache_values=True),
         batch_size=batch_size,
         generator=torch.Generator().manual_seed(seed),
     )
-    buffer.extend(
-        TensorDict({keys.INSTRUCTION_TOKENS: tokenizer(sentences), keys.KEYWORD: torch.tensor(meant)}, [count])
-    )
+    tokens = tokenizer(sentences)
+    by_length = (tokens != PADDING).sum(-1).argsort(stable=True)
+    said = {keys.INSTRUCTION_TOKENS: tokens, keys.KEYWORD: torch.tensor(meant)}
+    buffer.extend(TensorDict(said, [count])[by_length].set(TRAJECTORY, torch.zeros(count, dtype=torch.long)))
     return buffer

@@ -63,7 +63,7 @@ class Passenger:
         >>> Passenger().say("left", random.Random(6))
         'you should take a left turn'
         >>> Passenger().nonsense(random.Random(13))
-        'we might get a puppy'
+        'let me check the map'
     """
 
     def __init__(self, glove: Glove | None = None, max_words: int = 48) -> None:

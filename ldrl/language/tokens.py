@@ -29,15 +29,18 @@ RARE = 30_000
 EDITS = {4: 1, 5: 1}
 """How many letters may differ by the word's length: none in shorter words, two in longer ones."""
 
+NUMERALS = {"1": "one", "2": "two", "1st": "first", "2nd": "second", "1x": "once", "2x": "twice"}
+"""How often and which one in figures, and in words."""
+
 _WORD_OR_SYMBOL = re.compile(r"[^\W_]+|[^\w\s]")
 
 
 def normalise(sentence: str) -> list[str]:
     """Splits a sentence into words as speech transcripts write them.
 
-    Lower case; apostrophes, hyphens and all other punctuation separate words and are dropped. An emoji or
-    another symbol outside ASCII is a word of its own, so that "⬅" is an instruction that nobody understands
-    rather than none.
+    Lower case; small numbers in words; apostrophes, hyphens and all other punctuation separate words and are dropped.
+    An emoji or another symbol outside ASCII is a word of its own, so that "⬅" is an instruction that nobody
+    understands rather than none.
 
     Args:
         sentence: any text.
@@ -48,10 +51,12 @@ def normalise(sentence: str) -> list[str]:
     Examples:
         >>> normalise("You're going to turn-left, OK?")
         ['you', 're', 'going', 'to', 'turn', 'left', 'ok']
+        >>> normalise("2nd left")
+        ['second', 'left']
     """
     # NFKC first: accents join their letters and full-width letters become plain ones.
     found = _WORD_OR_SYMBOL.findall(unicodedata.normalize("NFKC", sentence).lower())
-    return [word for word in found if word.isalnum() or _is_symbol(word)]
+    return [NUMERALS.get(word, word) for word in found if word.isalnum() or _is_symbol(word)]
 
 
 def _is_symbol(character: str) -> bool:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from ldrl.language import PADDING, Tokenizer, WordEmbedding
 
@@ -122,7 +121,9 @@ class InstructionEncoder(nn.Module):
         self.decisive = nn.Embedding(len(self.decisive_tokens) + 1, decisive, padding_idx=0)
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
-        self.gru = nn.GRU(50 + decisive, hidden // 2, batch_first=True, bidirectional=True)
+        # Two instead of one that is bidirectional: on padded sequences, packed ones train four times as long on a CPU.
+        self.forward_gru = nn.GRU(50 + decisive, hidden // 2, batch_first=True)
+        self.backward_gru = nn.GRU(50 + decisive, hidden // 2, batch_first=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Encode instructions.
@@ -134,15 +135,19 @@ class InstructionEncoder(nn.Module):
             The GRU's state after each word, ``[*B, L, hidden]`` float32, zero for padding, and where there is a
             word, ``[*B, L]`` bool.
         """
-        flat = tokens.reshape(-1, tokens.shape[-1])
+        length = (tokens != PADDING).sum(-1).flatten()
+        longest = max([1, *length.tolist()])
+        flat = tokens[..., :longest].reshape(-1, longest)
         is_word = flat != PADDING
-        length = is_word.sum(-1).clamp(min=1).cpu()
         vectors = self.embedding(flat)
         if self.training:
             vectors = self.dropout(vectors + self.noise * torch.randn_like(vectors))
         found = flat.unsqueeze(-1) == self.decisive_tokens
         number = (found * torch.arange(1, found.shape[-1] + 1, device=flat.device)).sum(-1)
         vectors = torch.cat((vectors, self.decisive(number)), -1)
-        packed = pack_padded_sequence(vectors, length, batch_first=True, enforce_sorted=False)
-        states, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=tokens.shape[-1])
-        return states.view(*tokens.shape, -1), is_word.view(tokens.shape)
+        from_end = (length.unsqueeze(-1) - 1 - torch.arange(longest, device=flat.device)).clamp(min=0).unsqueeze(-1)
+        onward, _ = self.forward_gru(vectors)
+        backward, _ = self.backward_gru(vectors.take_along_dim(from_end, 1))
+        states = torch.cat((onward, backward.take_along_dim(from_end, 1)), -1) * is_word.unsqueeze(-1)
+        states = functional.pad(states, (0, 0, 0, tokens.shape[-1] - longest))
+        return states.view(*tokens.shape, -1), tokens != PADDING

@@ -1,6 +1,6 @@
 """Maps: street layouts and OpenDRIVE files, as highway-env road networks, compiled into tensors; routes on them."""
 
-from ldrl.towns.generator import random_layout, random_town
+from ldrl.towns.generator import random_layout
 from ldrl.towns.layout import LAYOUTS, Layout, load_layout
 from ldrl.towns.matching import match_route
 from ldrl.towns.routes import Route, UnrealisableError, plan_route, plan_routes
@@ -18,5 +18,4 @@ __all__ = [
     "plan_route",
     "plan_routes",
     "random_layout",
-    "random_town",
 ]

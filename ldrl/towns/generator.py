@@ -11,9 +11,8 @@ import random
 from itertools import pairwise
 
 from ldrl.towns.layout import Layout, Node
-from ldrl.towns.town import Town
 
-__all__ = ["random_layout", "random_town"]
+__all__ = ["random_layout"]
 
 BLOCKS = (3, 12)
 """Blocks of a town when not told; Town 1 has 7, Town 2 has 5."""
@@ -47,8 +46,10 @@ Graph = dict[Point, list[Point]]
 """The neighbours of each node; lists, because the order of a set is not the same everywhere."""
 
 
-def random_town(seed: int, blocks: int | None = None) -> Town:
+def random_layout(seed: int, blocks: int | None = None) -> Layout:
     """A random town of straight streets, corners, T- and four-way junctions, whose lanes all lead to each other.
+
+    :meth:`Town.load <ldrl.towns.Town.load>` makes the town from its name.
 
     Args:
         seed: the same seed makes the same town on every platform.
@@ -56,21 +57,15 @@ def random_town(seed: int, blocks: int | None = None) -> Town:
             town ten times as large. Drawn from 3 to 12 when not told.
 
     Returns:
-        The town, named ``random-<seed>``, or ``random-<seed>-<blocks>`` when told how many.
+        A layout named ``random-<seed>``, or ``random-<seed>-<blocks>`` when told how many.
 
     Raises:
         ValueError: fewer than two blocks.
 
     Examples:
-        >>> random_town(0).name, random_town(0, blocks=4).name
+        >>> random_layout(0).name, random_layout(0, blocks=4).name
         ('random-0', 'random-0-4')
     """
-    layout = random_layout(seed, blocks)
-    return Town(layout.name, layout.network())
-
-
-def random_layout(seed: int, blocks: int | None = None) -> Layout:
-    """The layout of :func:`random_town`, which has the same arguments."""
     if blocks is not None and blocks < 2:
         raise ValueError(f"blocks is {blocks}; a town needs at least 2 to have a junction")
     name = f"random-{seed}" if blocks is None else f"random-{seed}-{blocks}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zlib
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from torch.nn.functional import embedding
 
 from ldrl.subtasks import SubTask
 from ldrl.towns import opendrive, surface
+from ldrl.towns.generator import random_layout
 from ldrl.towns.ground import stations
 from ldrl.towns.layout import LAYOUTS, load_layout
 from ldrl.towns.scenery import REACH, Scenery
@@ -105,21 +107,31 @@ class Town(nn.Module):
 
     @classmethod
     def load(cls, name: str | Path) -> Town:
-        """A built-in town, or the map in an OpenDRIVE file.
+        """A built-in town, a random one, or the map in an OpenDRIVE file.
 
         Args:
-            name: ``"town1"``, ``"town2"`` or the path of a file that ends in ``.xodr``, see
+            name: ``"town1"`` or ``"town2"``; ``"random-<seed>"`` or ``"random-<seed>-<blocks>"``, see
+                :func:`~ldrl.towns.random_layout`; or the path of a file that ends in ``.xodr``, see
                 :func:`~ldrl.towns.opendrive.load_network`. The town of a file is named like the file, without folder.
 
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: no town has that name, or no town can be made of the file.
+
+        Examples:
+            >>> Town.load("random-7-4").name
+            'random-7-4'
         """
         name = str(name)
         if name.endswith(".xodr"):
             return cls(Path(name).name, opendrive.load_network(name))
+        random = re.fullmatch(r"random-(\d+)(?:-(\d+))?", name)
+        if random:
+            layout = random_layout(*(int(number) for number in random.groups() if number))
+            return cls(layout.name, layout.network())
         if name not in LAYOUTS:
-            raise ValueError(f"unknown town {name!r}; use one of {', '.join(LAYOUTS)}, or the path of a .xodr file")
+            known = ", ".join(LAYOUTS)
+            raise ValueError(f"unknown town {name!r}; use one of {known}, random-<seed>, or the path of a .xodr file")
         return cls(name, load_layout(name).network())
 
     def _buffer(self, name: str, value: Tensor | np.ndarray | list) -> None:

@@ -16,7 +16,7 @@ from ldrl.language.tokens import PADDING, UNKNOWN, Tokenizer, normalise
         ("you\u2019re \u2018going\u2019", ["you", "re", "going"]),
         ("left-hand turn\u2014now", ["left", "hand", "turn", "now"]),
         ("left,right;(go)", ["left", "right", "go"]),
-        ("the 2nd left", ["the", "2nd", "left"]),
+        ("the 2nd left", ["the", "second", "left"]),
         ("first_left", ["first", "left"]),
         ("  turn\t\nleft  ", ["turn", "left"]),
         ("\uff4c\uff45\uff46\uff54", ["left"]),

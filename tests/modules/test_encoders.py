@@ -68,13 +68,12 @@ def test_words_against_the_plain_recurrence(encoder):
     tokens = Tokenizer(max_tokens=7)(["turn left", "take the second right please", "straight"])
     states, is_word = encoder(tokens)
     assert states.shape == (3, 7, 6)
-    weights = encoder.gru.state_dict()
-    for suffix, half in (("_l0", slice(0, 3)), ("_l0_reverse", slice(3, 6))):
+    for gru, half in ((encoder.forward_gru, slice(0, 3)), (encoder.backward_gru, slice(3, 6))):
         cell = torch.nn.GRUCell(66, 3)
-        cell.load_state_dict({k.removesuffix(suffix): v for k, v in weights.items() if k.endswith(suffix)})
+        cell.load_state_dict({name.removesuffix("_l0"): value for name, value in gru.state_dict().items()})
         for row, length in enumerate((2, 5, 1)):
             state = torch.zeros(1, 3)
-            for k in range(length) if suffix == "_l0" else reversed(range(length)):
+            for k in range(length) if gru is encoder.forward_gru else reversed(range(length)):
                 # Word vectors that are learned: of those that decide, and zeros for all others.
                 which = (encoder.decisive_tokens == tokens[row, k]).nonzero().flatten()
                 learned = encoder.decisive.weight[which[0] + 1] if len(which) else torch.zeros(16)
@@ -110,7 +109,7 @@ def test_nothing_but_padding(encoder):
     assert not is_word[1].any()
     assert states.isfinite().all()
     states[0].sum().backward()
-    assert encoder.gru.weight_ih_l0.grad.isfinite().all()
+    assert encoder.backward_gru.weight_ih_l0.grad.isfinite().all()
 
 
 def test_words_are_disturbed_in_training_only(encoder):
@@ -125,5 +124,5 @@ def test_words_are_disturbed_in_training_only(encoder):
 
 
 def test_word_vectors_are_not_trained_and_not_saved(encoder):
-    assert {name.split(".")[0] for name in encoder.state_dict()} == {"decisive", "gru"}
-    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == {"decisive", "gru"}
+    assert {name.split(".")[0] for name in encoder.state_dict()} == {"decisive", "forward_gru", "backward_gru"}
+    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == {"decisive", "forward_gru", "backward_gru"}

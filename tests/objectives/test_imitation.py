@@ -238,7 +238,7 @@ def test_keyword_loss_trains_what_reads(agent):
     assert losses[-1] < 0.3 * losses[0]
     assert loss(data)["accuracy_keyword"] == 1
     trained = {name for name, parameter in agent.high_level.named_parameters() if parameter.requires_grad}
-    assert any(name.startswith("module.0.module.gru") for name in trained)
+    assert any(name.startswith("module.0.module.forward_gru") for name in trained)
 
 
 @pytest.mark.parametrize(

@@ -197,7 +197,8 @@ def test_evaluate_plans_what_is_asked_for(trained, episodes, towns, tmp_path, ca
 
     monkeypatch.setattr("ldrl.envs.builtin_episodes", lambda town, split="heldout", **most: plan(town, split, **most))
     monkeypatch.setattr("ldrl.envs.misleading_episodes", plan)
-    monkeypatch.setattr("ldrl.towns.random_town", lambda k: towns[TOWNS[k]])
+    load = Town.load
+    monkeypatch.setattr(Town, "load", lambda name: load(name.replace("random-0", "town1").replace("random-1", "town2")))
     printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", "appearance=rain", *arguments, cwd=tmp_path)
     assert error in (None, 0)
     assert found == asked

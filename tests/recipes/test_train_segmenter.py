@@ -10,7 +10,6 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from safetensors.torch import load_file
 
-import ldrl.towns
 from ldrl.envs import RoadSegmenter
 from ldrl.envs.appearance import WEATHERS
 from ldrl.towns import Town
@@ -21,10 +20,9 @@ BRIEF = ("steps=2", "batch=3", "towns=2", "frames=2", "network.depth_multiplier=
 
 @pytest.fixture
 def call(monkeypatch, capsys, tmp_path, towns, square):
-    """Runs the recipe; returns what it printed, its error if it exits with one, and the numbers of its towns."""
+    """Runs the recipe; returns what it printed, its error if it exits with one, and the names of its random towns."""
     asked = []
-    monkeypatch.setattr(Town, "load", towns.__getitem__)
-    monkeypatch.setattr(ldrl.towns, "random_town", lambda number: asked.append(number) or square)
+    monkeypatch.setattr(Town, "load", lambda name: towns[name] if name in towns else asked.append(name) or square)
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
@@ -44,7 +42,7 @@ def call(monkeypatch, capsys, tmp_path, towns, square):
 def test_trains_on_random_towns_and_measures_the_built_in_ones(call, tmp_path):
     out, error, asked = call(*BRIEF, "name=brief")
     assert error is None
-    assert asked == [10000, 10001]
+    assert asked == ["random-10000", "random-10001"]
     folder = tmp_path / "runs" / "brief"
     names = ["config.json", "model.safetensors", "preprocessor_config.json", "report.json", "report.md", "views.png"]
     assert sorted(path.name for path in folder.iterdir()) == names

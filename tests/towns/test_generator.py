@@ -11,7 +11,7 @@ from ldrl.collectors import Expert, evaluate
 from ldrl.envs import builtin_episodes
 from ldrl.language import KEYWORDS, realised_by
 from ldrl.subtasks import SubTask
-from ldrl.towns import plan_routes, random_layout, random_town
+from ldrl.towns import Town, plan_routes, random_layout
 from ldrl.towns.generator import SPACING, _take_away_a_street
 
 
@@ -38,7 +38,7 @@ def layouts():
 @pytest.fixture(scope="module")
 def town():
     """A town with two four-way junctions."""
-    return random_town(17)
+    return Town.load("random-17")
 
 
 def test_a_seed_is_one_town_on_every_platform(layouts):
