@@ -75,7 +75,7 @@ class Training:
         return driven
 
     def fit(self, title: str, losses: Sequence[LossModule], buffers: Sequence[Buffer], rows: int) -> None:
-        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences, from each buffer in turn."""
+        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences, of each buffer in turn."""
         parameters = [p for loss in losses for p in loss.parameters() if p.requires_grad]
         steps = self.cfg[f"{title}_steps"]
         optimizer = torch.optim.Adam(parameters)
@@ -194,7 +194,7 @@ def write_report(cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: 
         batches = {stage: cfg.drives_steps if stage == "high_level" else n for stage, n in batches.items()}
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
-        "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations; "
+        "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}; "
         + "; ".join(f"{stage}: {count:,} batches" for stage, count in batches.items()),
         "Seed": str(cfg.seed),
         "Training": training,

@@ -41,7 +41,7 @@ def start(recipe, *arguments, cwd):
 def trained(tmp_path_factory):
     """Where ``bc_hierarchical.py`` has run, and what it printed."""
     cwd = tmp_path_factory.mktemp("train")
-    done = start("bc_hierarchical.py", *BRIEF, *TINY, "name=brief", cwd=cwd)
+    done = start("bc_hierarchical.py", *BRIEF, *TINY, "name=brief", "towns=[town1,random-1002-12]", cwd=cwd)
     assert done.returncode == 0, done.stderr
     return cwd, done
 
@@ -91,6 +91,7 @@ def test_everything_is_written(trained):
         "tracks_town1.png",
         "tracks_town2.png",
     }
+    assert {path.name for path in (folder / "demonstrations").iterdir()} == {"town1", "random-1002-12"}
     for picture in folder.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     assert "runs/brief" in done.stdout
@@ -290,8 +291,8 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["town=atlantis"], "'atlantis'"),
-        (["test_town=atlantis"], "'atlantis'"),
+        (["towns=[atlantis]"], "'atlantis'"),
+        (["test_towns=[town2,atlantis]"], "'atlantis'"),
         (["size.features=0"], "features is 0; give a whole number above 0"),
         (["size.image_rows=10"], "rows is 10"),
         (["device=moon"], "moon"),

@@ -168,7 +168,7 @@ def test_a_lane_that_leads_nowhere_is_named():
 
 
 def test_unknown_town_is_named():
-    with pytest.raises(ValueError, match=r"'town3'; use one of town1, town2, random-<seed>, or the path of a \.xodr file"):
+    with pytest.raises(ValueError, match=r"'town3'; use one of town1, town2, random-<seed>, or the path"):
         Town.load("town3")
 
 
