@@ -59,21 +59,23 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
    CARLA's images are other ones than ours, and nobody has driven either agent in the other's.
 2. **Episodes** are all routes of our planner, not the paper's 159 and 142, so that `all` mixes the types in another
    proportion.
-3. **Sentences** come from our own templates on the paper's scale; evaluation says held-out ones only.
-4. **Sizes and schedule.** Networks of 0.9 million parameters, trained in minutes on two CPU cores.
-5. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,
+3. **Training towns.** Town 1 and six random towns, which have what Town 1 lacks: junctions of four streets, other lane
+   widths. Town 2, as in the paper, and the unseen towns are in no training.
+4. **Sentences** come from our own templates on the paper's scale; evaluation says held-out ones only.
+5. **Sizes and schedule.** Networks of 0.9 million parameters, trained in minutes on two CPU cores.
+6. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,
    images are not. It reads both ways. All models but NMC, which lacks the attention, share it.
-6. **Models share the low level** of Hih where the paper's differ in the high level only.
-7. **Training on rgb starts from the agent on gs**: the same road in other colours, which saves most of it. **ps is not
+7. **Models share the low level** of Hih where the paper's differ in the high level only.
+8. **Training on rgb starts from the agent on gs**: the same road in other colours, which saves most of it. **ps is not
    trained on**: agents trained on gs drive on it as they are. H0's high level sees no image, so that on rgb and ps it
    is that of gs.
-8. **Colours are seen relative to the road in front of the car and to the image's contrast, and looks are drawn for
+9. **Colours are seen relative to the road in front of the car and to the image's contrast, and looks are drawn for
    every image of the training**; the table of looks shows what the latter is worth.
-9. **The segmenter of ps** is a small DeepLabv3+ trained on random towns of ours, the paper's on photographs.
-10. **Views beside the path** are labelled by asking the expert there, where the paper shifts the steering of turned
+10. **The segmenter of ps** is a small DeepLabv3+ trained on random towns of ours, the paper's on photographs.
+11. **Views beside the path** are labelled by asking the expert there, where the paper shifts the steering of turned
     cameras by a constant: recovery is learned exactly.
-11. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step.
-12. **Misleading instructions**: a quarter of those in training; the paper says no share."""
+12. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step.
+13. **Misleading instructions**: a quarter of those in training; the paper says no share."""
 
 
 def results_page(results: Results, cells: Sequence[str], segmenter: Mapping[str, Any]) -> str:

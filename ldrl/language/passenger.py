@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import string
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from typing import Any
 
@@ -43,11 +43,14 @@ OPTIONAL = 0.2
 """Probability that a loose phrasing has a part that it may leave out."""
 CLEAN = 0.2
 """Share of commands that are said without anything around them."""
-CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.3, 0.1, 0.25, 0.5
+CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.35, 0.15, 0.25, 0.4
 """Shares of the other commands with a self-correction, fillers, talk around them, a repetition, slips of the tongue,
 the typing hand or the speech recogniser, and words dropped, replaced or inserted at random."""
+DENIED = 0.3
+"""Share of repetitions that go on with what is not meant."""
 RATE = 0.1
 """Probability that a word is dropped, replaced, or has another before it, in a sentence so disturbed."""
+DENIALS = ("not", "and not", "but not", "don t", "never", "rather than", "instead of")
 DIRECTIONS = ("left", "right", "straight")
 ORDINALS = ("first", "second")
 
@@ -89,9 +92,9 @@ class Passenger:
         if rng.random() < CLEAN:
             return plain
         happens = [rng.random() < share for share in (CORRECTED, DISTURBED, REPEATED, FILLED, TALKED, SLIPPED)]
-        for happened, change in zip(
-            happens, (self._correct, self._disturb, self._repeat, self._fill, self._talk, self._slip), strict=True
-        ):
+        repeat = partial(self._repeat, keyword)
+        changes = (self._correct, self._disturb, repeat, self._fill, self._talk, self._slip)
+        for happened, change in zip(happens, changes, strict=True):
             if happened:
                 words = change(words, rng)
         return " ".join(words) if 0 < len(words) <= self.max_words else plain
@@ -113,7 +116,8 @@ class Passenger:
             name, _, of_then = slot.strip("()").partition(":")
             if not slot.startswith("(") or rng.random() < OPTIONAL:
                 then = keyword.manoeuvres[-1].name.lower()
-                words = {"dir": then if of_then else keyword.manoeuvres[0].name.lower(), "then": then}
+                said = then if of_then else keyword.manoeuvres[0].name.lower()
+                words = {"dir": said, "then": then, "other": "right" if said == "left" else "left"}
                 parts.append(rng.choice(_spoken()["slots"][name]).format(**words))
         return " ".join(parts)
 
@@ -143,9 +147,13 @@ class Passenger:
         before = rng.randint(0, min(spot, 3))  # words said again in the second try
         return [*words[:spot], wrong_word, *marker, *words[spot - before :]]
 
-    def _repeat(self, words: list[str], rng: random.Random) -> list[str]:
-        """Say it again, in the same words."""
-        return words + rng.choice(_spoken()["slots"]["confirmations"]).split() + words
+    def _repeat(self, keyword: Keyword, words: list[str], rng: random.Random) -> list[str]:
+        """Say it again, in the same words, and perhaps what is not meant."""
+        again = words + rng.choice(_spoken()["slots"]["confirmations"]).split() + words
+        if rng.random() < DENIED:
+            another = rng.choice([other for other in KEYWORDS.values() if other != keyword])
+            again += rng.choice(DENIALS).split() + self._phrase(another, rng).split()
+        return again
 
     def _fill(self, words: list[str], rng: random.Random) -> list[str]:
         """Fill pauses, or stammer."""
@@ -157,10 +165,12 @@ class Passenger:
         return words
 
     def _talk(self, words: list[str], rng: random.Random) -> list[str]:
-        """Talk of other things before or after, with direction words in another sense."""
+        """Talk of other things before, after or between, with direction words in another sense."""
         for _ in range(rng.randint(1, 2)):
             said = rng.choice(_spoken()["slots"]["talk"]).split()
-            words = said + words if rng.random() < 0.6 else words + said
+            spot = rng.choice((0, 0, len(words), rng.randint(0, len(words))))
+            back = rng.choice(_spoken()["slots"]["fillers"]).split() if 0 < spot < len(words) else []
+            words = words[:spot] + said + back + words[spot:]
         return words
 
     def _slip(self, words: list[str], rng: random.Random) -> list[str]:
@@ -207,6 +217,6 @@ def training_words() -> tuple[str, ...]:
     """All words of the commands to train on: those that say which way and how often, those of the templates, others."""
     template = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
     used = {slot.strip("()").partition(":")[0] for name in KEYWORDS for slots in _loosely(name) for slot in slots}
-    loose = [part.format(dir="", then="") for slot in used - {"before", "after"} for part in _spoken()["slots"][slot]]
+    loose = [part.format(dir="", then="", other="") for slot in used - {"before", "after"} for part in _spoken()["slots"][slot]]
     usual, others = ({word for part in parts for word in part.split()} for parts in (template, loose))
     return tuple(sorted(usual | others, key=lambda word: (word not in MEANINGFUL, word not in usual, word)))

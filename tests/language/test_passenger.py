@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from ldrl.language import KEYWORDS, MEANINGFUL, Passenger, Sentences, load_glove, normalise
-from ldrl.language.passenger import training_words
+from ldrl.language.passenger import DENIALS, training_words
 
 DIRECTIONS = {"left", "right", "straight"}
 
@@ -68,10 +68,15 @@ def test_loose_phrasings_name_the_directions_of_their_keyword(passenger, monkeyp
     sentences = said(passenger, name, 500)
     assert len(set(sentences)) > 80
     for sentence in sentences:
-        named = DIRECTIONS.intersection(word.removesuffix("s") for word in sentence.split())
-        # Straight is also said as not turning, neither left nor right, and going on until a street comes.
-        at_once = "right after" in sentence or "right behind" in sentence
-        assert "straight" in meant or named - {"straight"} == meant | ({"right"} if at_once else set()), sentence
+        assert {word.removesuffix("s") for word in sentence.split()} >= meant - {"straight"}, sentence
+
+
+def test_parts_leave_their_directions_open(spoken):
+    """Straight is also said as neither left nor right, and what comes right after something is not on the right."""
+    of_a_turn = ["turn", "turn_statement", "double", "double_turns", "reversed", "reversed_turns", "same", "first", "second"]
+    for part in (part for slot in of_a_turn for part in spoken["slots"][slot]):
+        named = re.sub(r"\bright (after|behind|away|now|here)\b", "", part).split()
+        assert not {"left", "right", "lefts", "rights"}.intersection(named), part
 
 
 def test_slots_are_used_and_their_parts_clean(spoken):
@@ -125,9 +130,18 @@ def test_talk_uses_direction_words_in_another_sense(passenger, monkeypatch):
 
 def test_repetitions_say_the_same_twice(passenger, monkeypatch):
     only(monkeypatch, REPEATED=1.0)
+    monkeypatch.setattr("ldrl.language.passenger.DENIED", 0.0)
     for words in map(str.split, said(passenger, "right", 50)):
         again = [k for k in range(1, len(words) // 2 + 1) if words[:k] == words[-k:]]
         assert any("right" in words[:k] for k in again), words
+
+
+def test_a_denial_follows_what_is_meant(passenger, monkeypatch):
+    only(monkeypatch, REPEATED=1.0)
+    monkeypatch.setattr("ldrl.language.passenger.DENIED", 1.0)
+    for words in map(str.split, said(passenger, "right", 50)):
+        before = [words[:k] for k in range(len(words)) if " ".join(words[k:]).startswith(DENIALS)]
+        assert any(b[:k] == b[-k:] and "right" in b[:k] for b in before for k in range(1, len(b) // 2 + 1)), words
 
 
 def test_slips_change_a_letter_or_take_a_word_for_another(passenger, monkeypatch):
