@@ -5,7 +5,7 @@
     python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
     python recipes/bc_hierarchical.py preset=rgb               # from colour images
     python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
-    python recipes/bc_hierarchical.py model=hi stages=[language,high_level] start_from.low_level=runs/hih
+    python recipes/bc_hierarchical.py model=hi stages=[language,high_level] start_from.low_level=runs/hih  # not anew
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """
@@ -17,7 +17,7 @@ import shutil
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -144,31 +144,33 @@ class Training:
         encoder.requires_grad_(True)
 
 
-def start_from(agent: Agent, checkpoints: Sequence[str]) -> list[str]:
-    """Copy parts of trained agents: the largest that fit (same name, same tensors), each from the first that has it.
+def start_from(agent: Agent, checkpoints: Mapping[str, str | None]) -> list[str]:
+    """Copy the largest parts of trained agents that fit: same name, same tensors.
+
+    Args:
+        agent: what is to be trained.
+        checkpoints: where ``low_level`` and ``high_level`` are taken from.
 
     Returns:
-        Their names.
+        The names of the parts.
     """
     # A single policy is made of the parts of a high-level policy.
     own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
-    trained = [
-        {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
-        for checkpoint in checkpoints
-    ]
+    networks = {"low_level": ("control", "end_of_subtask"), "high_level": (own,)}
     copied: list[str] = []
-    for name, module in agent.named_modules():
-        if not name or any(name.startswith(f"{part}.") for part in copied):
+    for level, checkpoint in checkpoints.items():
+        if checkpoint is None:
             continue
-        shapes = {key: value.shape for key, value in module.state_dict().items()}
-        for theirs in trained:
-            if not shapes or type(theirs.get(name)) is not type(module):
+        trained = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
+        for name, module in agent.named_modules():
+            if name.split(".")[0] not in networks[level] or any(name.startswith(f"{part}.") for part in copied):
                 continue
-            weights = theirs[name].state_dict()
-            if shapes == {key: value.shape for key, value in weights.items()}:
-                module.load_state_dict(weights)
+            theirs, shapes = trained.get(name), {key: value.shape for key, value in module.state_dict().items()}
+            if not shapes or type(theirs) is not type(module):
+                continue
+            if shapes == {key: value.shape for key, value in theirs.state_dict().items()}:
+                module.load_state_dict(theirs.state_dict())
                 copied.append(name)
-                break
     return copied
 
 
@@ -225,9 +227,9 @@ def main(cfg: DictConfig) -> None:
         if cfg.misleading and not MODELS[cfg.model].hierarchical:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
         agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
-        if cfg.start_from:
-            copied = start_from(agent, [str(checkpoint) for checkpoint in cfg.start_from])
-            print(f"Taken from {', '.join(cfg.start_from)}: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        if any(cfg.start_from.values()):
+            copied = start_from(agent, cfg.start_from)
+            print(f"Taken from trained agents: {', '.join(copied) or 'nothing, as nothing fits'}.")
         training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")

@@ -117,16 +117,17 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 given |= {"checkpoint": taken[0], "out": folder / name / REPORT, **settings.evaluation}
             else:
                 recipe = TRAINING
-                taken_from = {"start_from": taken} if taken else {}
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
-                given = own | given | taken_from
+                taken_from = given.pop("start_from", {})
+                given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
             cells.append(Cell(folder / name, recipe, tuple(argument(*item) for item in given.items()), taken))
     return cells
 
 
 def needs(given: Mapping[str, Any]) -> list[str]:
     """The cells that a cell's arguments name."""
-    return [given["checkpoint"]] if "checkpoint" in given else given.get("start_from", [])
+    named = [given["checkpoint"]] if "checkpoint" in given else given.get("start_from", {}).values()
+    return list(dict.fromkeys(named))
 
 
 def argument(name: str, value: object) -> str:

@@ -217,6 +217,10 @@ def training_words() -> tuple[str, ...]:
     """All words of the commands to train on: those that say which way and how often, those of the templates, others."""
     template = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
     used = {slot.strip("()").partition(":")[0] for name in KEYWORDS for slots in _loosely(name) for slot in slots}
-    loose = [part.format(dir="", then="", other="") for slot in used - {"before", "after"} for part in _spoken()["slots"][slot]]
+    loose = [
+        part.format(dir="", then="", other="")
+        for slot in used - {"before", "after"}
+        for part in _spoken()["slots"][slot]
+    ]
     usual, others = ({word for part in parts for word in part.split()} for parts in (template, loose))
     return tuple(sorted(usual | others, key=lambda word: (word not in MEANINGFUL, word not in usual, word)))

@@ -73,7 +73,17 @@ def test_loose_phrasings_name_the_directions_of_their_keyword(passenger, monkeyp
 
 def test_parts_leave_their_directions_open(spoken):
     """Straight is also said as neither left nor right, and what comes right after something is not on the right."""
-    of_a_turn = ["turn", "turn_statement", "double", "double_turns", "reversed", "reversed_turns", "same", "first", "second"]
+    of_a_turn = [
+        "turn",
+        "turn_statement",
+        "double",
+        "double_turns",
+        "reversed",
+        "reversed_turns",
+        "same",
+        "first",
+        "second",
+    ]
     for part in (part for slot in of_a_turn for part in spoken["slots"][slot]):
         named = re.sub(r"\bright (after|behind|away|now|here)\b", "", part).split()
         assert not {"left", "right", "lefts", "rights"}.intersection(named), part

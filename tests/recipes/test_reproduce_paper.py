@@ -70,7 +70,7 @@ def test_every_cell_once_and_after_what_it_needs(reproduce):
     assert error is None, printed
     assert sorted(made) == sorted(f"seed0/{cell}" for cell in CONFIG["cells"])
     for cell, given in CONFIG["cells"].items():
-        for needed in [given["checkpoint"]] if "checkpoint" in given else given.get("start_from", []):
+        for needed in [given["checkpoint"]] if "checkpoint" in given else given.get("start_from", {}).values():
             assert made.index(f"seed0/{needed}") < made.index(f"seed0/{cell}")
     assert "driven with" in Path("runs/paper/seed0/gs-hih/output.txt").read_text()
 
@@ -88,7 +88,8 @@ def test_a_command_is_one_that_a_user_can_type(reproduce):
     made = json.loads(Path("runs/paper/seed0/rgb-h0/made.json").read_text())
     assert made["command"] == (
         "python recipes/bc_hierarchical.py name=paper/seed0/rgb-h0 seed=0 preset=default "
-        "'start_from=[runs/paper/seed0/rgb-hih,runs/paper/seed0/gs-h0]' 'stages=[]' model=h0 modality=rgb"
+        "'stages=[]' model=h0 modality=rgb start_from.low_level=runs/paper/seed0/rgb-low "
+        "start_from.high_level=runs/paper/seed0/gs-h0"
     )
     made = json.loads(Path("runs/paper/seed0/gs-hih-unseen/made.json").read_text())
     assert made["command"] == (
