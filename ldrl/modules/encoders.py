@@ -21,7 +21,7 @@ BUMPER = (slice(-10, None), slice(60, 140))
 
 
 class ImageEncoder(nn.Module):
-    """Three convolutions with ELU.
+    """Three convolutions, each normalised over all channels and places (group norm of one group), with ELU.
 
     Colours are taken relative to the mean colour of the road in front of the car and to the image's contrast, so that
     neither the light nor the asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look from
@@ -50,7 +50,7 @@ class ImageEncoder(nn.Module):
         height, width = rows, 200
         layers: list[nn.Module] = []
         for channel, (kernel, stride) in zip(channels, KERNELS, strict=True):
-            layers += [nn.Conv2d(in_channels, channel, kernel, stride), nn.ELU()]
+            layers += [nn.Conv2d(in_channels, channel, kernel, stride), nn.GroupNorm(1, channel), nn.ELU()]
             in_channels = channel
             height, width = ((size - kernel) // stride + 1 for size in (height, width))
         if height < 1 or rows > 88:
