@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import string
+from collections.abc import Callable
 from functools import cache, partial
 from importlib import resources
 from typing import Any
@@ -93,7 +94,7 @@ class Passenger:
             return plain
         happens = [rng.random() < share for share in (CORRECTED, DISTURBED, REPEATED, FILLED, TALKED, SLIPPED)]
         repeat = partial(self._repeat, keyword)
-        changes = (self._correct, self._disturb, repeat, self._fill, self._talk, self._slip)
+        changes: list[Callable] = [self._correct, self._disturb, repeat, self._fill, self._talk, self._slip]
         for happened, change in zip(happens, changes, strict=True):
             if happened:
                 words = change(words, rng)
