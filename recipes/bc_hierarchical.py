@@ -3,7 +3,7 @@
     python recipes/bc_hierarchical.py                          # a laptop's preset: the full model on gs
     python recipes/bc_hierarchical.py preset=smoke             # everything once, to see it run
     python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
-    python recipes/bc_hierarchical.py preset=rgb               # from colour images
+    python recipes/bc_hierarchical.py modality=rgb              # from colour images
     python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
     python recipes/bc_hierarchical.py model=hi stages=[language,high_level] start_from.low_level=runs/hih  # not anew
 
