@@ -75,11 +75,7 @@ class Training:
         return driven
 
     def fit(self, title: str, losses: Sequence[LossModule], buffers: Sequence[Buffer], rows: int) -> None:
-        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences.
-
-        Every second batch is from the first buffer, the others are from the rest in turn.
-        """
-        turns = [buffer for other in buffers[1:] for buffer in (buffers[0], other)] or buffers
+        """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences, of each buffer in turn."""
         parameters = [p for loss in losses for p in loss.parameters() if p.requires_grad]
         steps = self.cfg[f"{title}_steps"]
         optimizer = torch.optim.Adam(parameters)
@@ -88,7 +84,7 @@ class Training:
         history: dict[str, list[float]] = defaultdict(list)
         bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
         for step in bar:
-            batch = turns[step % len(turns)].sample().reshape(rows, -1).to(self.cfg.device)
+            batch = buffers[step % len(buffers)].sample().reshape(rows, -1).to(self.cfg.device)
             outputs = [loss(batch) for loss in losses]
             sum(value for output in outputs for name, value in output.items() if name.startswith("loss_")).backward()
             torch.nn.utils.clip_grad_norm_(parameters, self.cfg.max_grad_norm)
