@@ -59,8 +59,8 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
    CARLA's images are other ones than ours, and nobody has driven either agent in the other's.
 2. **Episodes** are all routes of our planner, not the paper's 159 and 142, so that `all` mixes the types in another
    proportion.
-3. **Training towns.** Town 1 and six random towns, which have what Town 1 lacks: junctions of four streets, other lane
-   widths. Town 2, as in the paper, and the unseen towns are in no training.
+3. **Training towns.** Town 1 and six random towns, which have what Town 1 lacks: junctions of four streets. Town 2, as
+   in the paper, and the unseen towns are in no training.
 4. **Sentences** come from our own templates on the paper's scale; evaluation says held-out ones only.
 5. **Sizes and schedule.** Networks of 0.9 million parameters with normalised convolutions, trained in minutes on two
    CPU cores.
