@@ -32,7 +32,7 @@ def test_a_sample_has_little_padding_and_samples_reach_everywhere(buffer):
     every = (buffer.storage[:][keys.INSTRUCTION_TOKENS] != PADDING).sum(-1)
     assert mean == pytest.approx(float(every.float().mean()), rel=0.1)
     assert sum(widest) / len(widest) < 1.2 * mean
-    assert min(map(int, map(torch.min, lengths))) == int(every.min())
+    assert min(map(int, map(torch.min, lengths))) < float(every.float().quantile(0.02)) + 1
     assert max(widest) > float(every.float().quantile(0.98))
 
 
