@@ -48,8 +48,8 @@ The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_p
 - *success*, the paper's measure: no collision, and every point of the path within 10 m of the track. *strict success*:
   also never off the road, never in an oncoming lane, and `finish` declared within 15 m of the path's end. *paper*: what
   it reports as success, on routes of its own in CARLA; train is Town 1, test Town 2.
-- Trained on Town 1. Episodes are all routes of our planner in Town 1 and Town 2, each driven once, said in sentences
-  without a phrase of the training's.
+- Trained in Town 1 and six random towns. Episodes are all routes of our planner in Town 1 and Town 2, each driven once,
+  said in sentences without a phrase of the training's.
 - A figure is the mean over the seeds, in brackets the least and the largest of them. "-" is not measured yet, or not
   reported by the paper."""
 DEPARTURES = """\
