@@ -43,6 +43,7 @@ from ldrl.collectors import (
     collect_sentences,
     evaluate,
 )
+from ldrl.collectors.paper import paper_success
 from ldrl.collectors.plots import plot_losses, plot_tracks
 from ldrl.collectors.report import replacing, table, to_markdown, write_json
 from ldrl.envs import Episode, builtin_episodes, make_camera, misleading_episodes
@@ -207,10 +208,12 @@ def write_report(cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: 
     write_json(outcomes, folder / "report.json", details)
     for town in towns.values():
         plot_tracks(outcomes, town, folder / f"tracks_{town.name}.png")
-    report = to_markdown(outcomes, title=folder.name, details=details)
+    paper = paper_success(agent.config, misleading=bool(cfg.misleading))
+    report = to_markdown(outcomes, title=folder.name, paper=paper, details=details)
     with replacing(folder / "report.md") as file:
         file.write_text(report, encoding="utf-8")
-    print(f"\n{table(outcomes)}\nEverything is in {folder}/; start with report.md and tracks_{next(iter(towns))}.png.")
+    start = f"report.md and tracks_{next(iter(towns))}.png"
+    print(f"\n{table(outcomes, paper)}\nEverything is in {folder}/; start with {start}.")
 
 
 @hydra.main(config_path="config", config_name="bc_hierarchical", version_base="1.3")

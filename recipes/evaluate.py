@@ -25,7 +25,8 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ldrl.collectors import evaluate
-from ldrl.collectors.report import PAPER, PAPER_MISLEADING, check_writable, keyword_table, table, write_json
+from ldrl.collectors.paper import paper_success
+from ldrl.collectors.report import check_writable, keyword_table, table, write_json
 from ldrl.envs import DashCamera, Episode, builtin_episodes, load_episodes, misleading_episodes
 from ldrl.language import Family
 from ldrl.modules import load_agent
@@ -81,7 +82,7 @@ def main(cfg: DictConfig) -> None:
         for towns, episodes in chain([first], chosen):
             bar.total += len(episodes)
             outcomes += evaluate(agent, episodes, towns, progress=bar.update, **settings)
-    paper = PAPER_MISLEADING if cfg.episodes == "misleading" else PAPER
+    paper = paper_success(agent.config, misleading=cfg.episodes == "misleading")
     print(f"{table(outcomes, paper)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
         write_json(outcomes, str(cfg.out))

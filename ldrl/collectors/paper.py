@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["LEAST_IOU", "SUCCESS", "TARGETS", "Target"]
+from ldrl.modules import AgentConfig
+
+__all__ = ["LEAST_IOU", "SUCCESS", "TARGETS", "Success", "Target", "paper_success"]
 
 Success = dict[str, dict[str, float]]
 """Success rates by town and type of keyword; the paper trains on Town 1 and tests on Town 2 too."""
@@ -40,6 +42,16 @@ SUCCESS: dict[str, Success] = {
     "gs-hih-misleading": _success(single=(1.000, 1.000), double=(1.000, 0.928), all=(1.000, 0.946)),
 }
 """By modality and model. For double of Hih in Town 2, Table 2 has 0.986 and Table 3 0.960."""
+
+
+def paper_success(config: AgentConfig, *, misleading: bool = False) -> Success:
+    """What the paper reports of an agent of the same model and modality; nothing of those that it does not have.
+
+    Args:
+        config: the agent's.
+        misleading: on misleading instructions.
+    """
+    return SUCCESS.get(f"{config.modality}-{config.model}{'-misleading' if misleading else ''}", {})
 
 
 class Target(NamedTuple):

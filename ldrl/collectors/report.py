@@ -13,12 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ldrl.collectors.evaluation import FINISH_NEAR, NEAR, Outcome
-from ldrl.collectors.paper import SUCCESS
+from ldrl.collectors.paper import Success
 from ldrl.language import KEYWORDS
 
 __all__ = [
-    "PAPER",
-    "PAPER_MISLEADING",
     "check_writable",
     "keyword_table",
     "markdown_table",
@@ -30,19 +28,14 @@ __all__ = [
     "write_json",
 ]
 
-PAPER = SUCCESS["gs-hih"]
-"""Success of the paper's full model, Hih: Roh et al. 2019, Table 2, ``gs``; train is Town 1, test is Town 2.
-For double in Town 2 its Table 3 prints 0.960."""
-PAPER_MISLEADING = SUCCESS["gs-hih-misleading"]
-"""The same for misleading instructions only."""
 NOTES = (
     f"- success, the paper's measure: no collision, and every point of the path within {NEAR:.0f} m of the track; "
     "a car that should stop must also stand that near to the path's last point.",
     "- strict success: success, never off the road, never in an oncoming lane outside junctions, and `finish` declared "
     f"within {FINISH_NEAR:.0f} m of the end of the path.",
     "- stuck: episodes in which the car came to a stand without having declared `finish`.",
-    "- paper: success of Hih on ground-truth segmentation, Table 2 of Roh et al. 2019 (train: Town 1, test: Town 2), "
-    "on routes of its own in CARLA. Its Table 3 prints 0.960 for double in Town 2, where Table 2 has 0.986.",
+    "- paper: success of the same model on the same input in Roh et al. 2019 (train: Town 1, test: Town 2), on routes "
+    "of its own in CARLA.",
 )
 MOST_SHOWN_TOWNS = 4
 SHOWN_CHARACTERS = 160  # of an instruction in the Markdown report; the JSON file has all
@@ -170,17 +163,18 @@ def _temporary_beside(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def table(outcomes: Sequence[Outcome], paper: Mapping[str, Mapping[str, float]] = PAPER) -> str:
+def table(outcomes: Sequence[Outcome], paper: Success | None = None) -> str:
     """The main table, for a terminal and for the report.
 
     Args:
         outcomes: of any towns.
-        paper: success in the paper, by town and type.
+        paper: success in the paper, see :func:`~ldrl.collectors.paper.paper_success`.
 
     Returns:
         A Markdown table: a row per town and type, then ``all``, with the paper's figure where it has one. More than
         four towns are taken together.
     """
+    paper = paper or {}
     rows = [("town", "type", "episodes", "success", "strict success", "stuck", "paper")]
     for town, summary in _summaries(outcomes).items():
         for name, rates in (summary["types"] | {"all": summary}).items():
@@ -200,12 +194,19 @@ def keyword_table(outcomes: Sequence[Outcome]) -> str:
     return markdown_table(rows, left=2)
 
 
-def to_markdown(outcomes: Sequence[Outcome], *, title: str = "Report", details: Mapping[str, str] | None = None) -> str:
+def to_markdown(
+    outcomes: Sequence[Outcome],
+    *,
+    title: str = "Report",
+    paper: Success | None = None,
+    details: Mapping[str, str] | None = None,
+) -> str:
     """A report to read: the main table, one per keyword, every episode that went wrong, and how it came about.
 
     Args:
         outcomes: of any towns.
         title: the heading.
+        paper: success in the paper, as in :func:`table`.
         details: what else to tell by name, such as the configuration, the hardware, wall times and seeds.
 
     Returns:
@@ -215,7 +216,7 @@ def to_markdown(outcomes: Sequence[Outcome], *, title: str = "Report", details: 
     parts = [
         f"# {_cell(title)}",
         f"{len(outcomes)} episodes, one drive each; {sum(outcome.stuck for outcome in outcomes)} of them ended stuck.",
-        table(outcomes),
+        table(outcomes, paper),
         "\n".join(NOTES),
         "## Per keyword",
         keyword_table(outcomes),

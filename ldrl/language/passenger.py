@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import string
+from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from importlib import resources
@@ -44,14 +45,18 @@ OPTIONAL = 0.2
 """Probability that a loose phrasing has a part that it may leave out."""
 CLEAN = 0.2
 """Share of commands that are said without anything around them."""
+SHORTENED = 0.2
+"""Share of the other commands of which only the words that decide are sure to be left."""
 CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.35, 0.15, 0.25, 0.4
-"""Shares of the other commands with a self-correction, fillers, talk around them, a repetition, slips of the tongue,
-the typing hand or the speech recogniser, and words dropped, replaced or inserted at random."""
+"""Shares of them with a self-correction, fillers, talk around them, a repetition, slips of the tongue, the typing hand
+or the speech recogniser, and words dropped, replaced or inserted at random."""
 DENIED = 0.3
 """Share of repetitions that go on with what is not meant."""
 RATE = 0.1
 """Probability that a word is dropped, replaced, or has another before it, in a sentence so disturbed."""
 DENIALS = ("not", "and not", "but not", "don t", "never", "rather than", "instead of")
+TURNING_ROUND = ("after", "before", "once")
+NEGATIONS = ("no", "not", "don", "never")
 DIRECTIONS = ("left", "right", "straight")
 ORDINALS = ("first", "second")
 
@@ -92,6 +97,8 @@ class Passenger:
         words = plain.split()
         if rng.random() < CLEAN:
             return plain
+        if rng.random() < SHORTENED:
+            words = self._shorten(keyword, words, rng)
         happens = [rng.random() < share for share in (CORRECTED, DISTURBED, REPEATED, FILLED, TALKED, SLIPPED)]
         repeat = partial(self._repeat, keyword)
         changes: list[Callable] = [self._correct, self._disturb, repeat, self._fill, self._talk, self._slip]
@@ -121,6 +128,17 @@ class Passenger:
                 words = {"dir": said, "then": then, "other": "right" if said == "left" else "left"}
                 parts.append(rng.choice(_spoken()["slots"][name]).format(**words))
         return " ".join(parts)
+
+    def _shorten(self, keyword: Keyword, words: list[str], rng: random.Random) -> list[str]:
+        """Leave out what the meaning does not need, if the keyword's own words say it, in its order."""
+        own = keyword.name.replace(",", " ").split()
+        meant, said = ([word for word in text if word in DIRECTIONS] for text in (own, words))
+        counted = keyword.type != "ordinal" or all((word in words) == (word in own) for word in ORDINALS)
+        if said != meant or not counted or not set(words).isdisjoint(NEGATIONS):
+            return words
+        rate = rng.uniform(0.3, 1)
+        # "Left and after that right" must not come to "left after right".
+        return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
 
     def _disturb(self, words: list[str], rng: random.Random) -> list[str]:
         """Drop, replace and insert words that do not say which way or how often."""
@@ -215,7 +233,10 @@ def _loosely(name: str) -> list[list[str]]:
 
 @cache
 def training_words() -> tuple[str, ...]:
-    """All words of the commands to train on: those that say which way and how often, those of the templates, others."""
+    """All words of the commands to train on: those that say which way and how often, those of the templates, others.
+
+    Among each, the words that stand in the most parts of commands come first.
+    """
     template = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
     used = {slot.strip("()").partition(":")[0] for name in KEYWORDS for slots in _loosely(name) for slot in slots}
     loose = [
@@ -223,5 +244,7 @@ def training_words() -> tuple[str, ...]:
         for slot in used - {"before", "after"}
         for part in _spoken()["slots"][slot]
     ]
-    usual, others = ({word for part in parts for word in part.split()} for parts in (template, loose))
-    return tuple(sorted(usual | others, key=lambda word: (word not in MEANINGFUL, word not in usual, word)))
+    usual, others = (Counter(word for part in parts for word in part.split()) for parts in (template, loose))
+    known = usual + others
+    order = sorted(known, key=lambda word: (word not in MEANINGFUL, word not in usual, -known[word], word))
+    return tuple(order)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ldrl.language import PADDING, Tokenizer, WordEmbedding
+from ldrl.language.passenger import training_words
 
 __all__ = ["ImageEncoder", "InstructionEncoder"]
 
@@ -85,25 +86,19 @@ class ImageEncoder(nn.Module):
         return (absolute - offset[..., None, None]) / contrast + first.bias[:, None, None]
 
 
-DECISIVE = (
-    "left right straight first second next two twice times both another again more couple not don t no one once after "
-    "before past pass skip then and other neither until instead"
-)
-"""Words on which the meaning of an instruction turns. GloVe holds left and right, or first and second, for nearly the
-same, so these have a second vector that is learned."""
-
-
 class InstructionEncoder(nn.Module):
-    """Frozen GloVe vectors, with learned ones of decisive words, through a single-layer GRU that reads both ways.
+    """Frozen GloVe vectors, with learned ones of usual words, through a single-layer GRU that reads both ways.
 
-    In training the vectors are disturbed, so that words with like vectors come to count alike and a sentence is
-    understood that was never trained on.
+    GloVe holds left and right, or first and second, for nearly the same; so the words that training commands use most
+    have a second vector, which is learned. In training the vectors are disturbed and some of the learned ones left out,
+    so that words with like vectors come to count alike and a sentence is understood that was never trained on.
 
     Args:
         hidden: size of a word's state, half of it of the GRU that reads backwards; an even number.
-        noise: standard deviation of Gaussian noise on the vectors in training.
-        dropout: share of their components that is dropped in training.
-        decisive: size of the learned vectors; zero for all other words.
+        noise: standard deviation of Gaussian noise on GloVe's vectors in training.
+        dropout: share of their components that is dropped in training, and of the words whose learned vector is.
+        usual: how many words have a learned vector; it is zero for all others.
+        learned: size of the learned vectors.
 
     Examples:
         >>> states, is_word = InstructionEncoder(32)(torch.tensor([[5, 6, 0, 0]]))
@@ -111,19 +106,21 @@ class InstructionEncoder(nn.Module):
         (torch.Size([1, 4, 32]), tensor([[ True,  True, False, False]]))
     """
 
-    decisive_tokens: Tensor
+    usual_tokens: Tensor
 
-    def __init__(self, hidden: int, noise: float = 0.15, dropout: float = 0.1, decisive: int = 16) -> None:
+    def __init__(
+        self, hidden: int, noise: float = 0.15, dropout: float = 0.1, usual: int = 300, learned: int = 16
+    ) -> None:
         super().__init__()
         self.embedding = WordEmbedding()
-        tokens = Tokenizer()([DECISIVE])[0]
-        self.register_buffer("decisive_tokens", tokens[tokens != PADDING], persistent=False)
-        self.decisive = nn.Embedding(len(self.decisive_tokens) + 1, decisive, padding_idx=0)
+        # Saved with the weights: other training commands may have other usual words.
+        self.register_buffer("usual_tokens", Tokenizer(usual)([" ".join(training_words()[:usual])])[0].sort().values)
+        self.learned = nn.Embedding(usual + 1, learned, padding_idx=0)
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
         # Two instead of one that is bidirectional: on padded sequences, packed ones train four times as long on a CPU.
-        self.forward_gru = nn.GRU(50 + decisive, hidden // 2, batch_first=True)
-        self.backward_gru = nn.GRU(50 + decisive, hidden // 2, batch_first=True)
+        self.forward_gru = nn.GRU(50 + learned, hidden // 2, batch_first=True)
+        self.backward_gru = nn.GRU(50 + learned, hidden // 2, batch_first=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Encode instructions.
@@ -140,11 +137,12 @@ class InstructionEncoder(nn.Module):
         flat = tokens[..., :longest].reshape(-1, longest)
         is_word = flat != PADDING
         vectors = self.embedding(flat)
+        place = torch.searchsorted(self.usual_tokens, flat.contiguous()).clamp(max=len(self.usual_tokens) - 1)
+        usual = self.usual_tokens[place] == flat
         if self.training:
             vectors = self.dropout(vectors + self.noise * torch.randn_like(vectors))
-        found = flat.unsqueeze(-1) == self.decisive_tokens
-        number = (found * torch.arange(1, found.shape[-1] + 1, device=flat.device)).sum(-1)
-        vectors = torch.cat((vectors, self.decisive(number)), -1)
+            usual &= torch.rand(usual.shape, device=flat.device) >= self.dropout.p
+        vectors = torch.cat((vectors, self.learned((place + 1) * usual)), -1)
         from_end = (length.unsqueeze(-1) - 1 - torch.arange(longest, device=flat.device)).clamp(min=0).unsqueeze(-1)
         onward, _ = self.forward_gru(vectors)
         backward, _ = self.backward_gru(vectors.take_along_dim(from_end, 1))

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from ldrl.collectors.evaluation import Outcome
+from ldrl.collectors.paper import SUCCESS, paper_success
 from ldrl.collectors.report import (
-    PAPER,
-    PAPER_MISLEADING,
     check_writable,
     keyword_table,
     replacing,
@@ -19,6 +18,7 @@ from ldrl.collectors.report import (
     write_json,
 )
 from ldrl.envs import Episode
+from ldrl.modules import AgentConfig
 
 ODD_IDS = ["", "a|b", "1\n2", "日本 🚗", "\ud800", "../x", "null", "a|b"]
 
@@ -156,21 +156,26 @@ def test_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_table_stands_beside_the_papers_figures(outcomes):
-    text = table(outcomes)
+    text = table(outcomes, SUCCESS["gs-hih"])
     assert cells(text, "town1", "single") == ["2", "1.000", "0.500", "0", "1.000"]
     assert cells(text, "town1", "all") == ["3", "0.667", "0.333", "1", "1.000"]
     assert cells(text, "town2", "double") == ["1", "0.000", "0.000", "0", "0.986"]
     assert cells(text, "town2", "all")[-1] == "0.970"
     assert "double" not in "".join(line for line in text.splitlines() if "town1" in line)
     assert len({len(line) for line in text.splitlines()}) == 1
-    assert text in to_markdown(outcomes)
+    assert text in to_markdown(outcomes, paper=SUCCESS["gs-hih"])
 
 
 def test_other_towns_have_no_figure_in_the_paper():
-    assert cells(table([outcome(town="elsewhere")]), "elsewhere", "all")[-1] == "-"
-    misled = table([outcome(town="town2", keyword="left,left")], PAPER_MISLEADING)
-    assert cells(misled, "town2", "double")[-1] == "0.928"
-    assert PAPER["town2"] == {"single": 1.0, "double": 0.986, "ordinal": 0.938, "all": 0.97}
+    assert cells(table([outcome(town="elsewhere")], SUCCESS["gs-hih"]), "elsewhere", "all")[-1] == "-"
+    assert cells(table([outcome()]), "town1", "all")[-1] == "-"
+
+
+def test_the_papers_figures_are_of_the_same_model_on_the_same_input():
+    assert paper_success(AgentConfig())["town2"] == {"single": 1.0, "double": 0.986, "ordinal": 0.938, "all": 0.97}
+    assert paper_success(AgentConfig(modality="rgb"))["town2"]["ordinal"] == 0.333
+    assert paper_success(AgentConfig(), misleading=True)["town2"]["double"] == 0.928
+    assert paper_success(AgentConfig(model="hihg", modality="rgb")) == {}
 
 
 def test_keyword_table_has_the_towns_side_by_side(outcomes):

@@ -36,7 +36,7 @@ def said(passenger, name, count, seed=0):
 
 def only(monkeypatch, **shares):
     """Let nothing happen to a sentence but what is named."""
-    for name in ("CLEAN", "CORRECTED", "FILLED", "TALKED", "REPEATED", "SLIPPED", "DISTURBED", "LOOSE"):
+    for name in ("CLEAN", "SHORTENED", "CORRECTED", "FILLED", "TALKED", "REPEATED", "SLIPPED", "DISTURBED", "LOOSE"):
         monkeypatch.setattr(f"ldrl.language.passenger.{name}", shares.get(name, 0.0))
 
 
@@ -119,6 +119,46 @@ def test_what_says_which_way_survives_random_words(passenger, monkeypatch):
         assert inside([word for word in plain if word in MEANINGFUL], sentence)
         changed += sentence != plain
     assert 200 < changed < 300
+
+
+@pytest.mark.parametrize("name", KEYWORDS)
+def test_shortened_commands_keep_what_says_which_way(passenger, monkeypatch, name):
+    only(monkeypatch, SHORTENED=1.0)
+    rng = random.Random(3)
+    terse = Counter()
+    for _ in range(300):
+        state = rng.getstate()
+        plain = passenger._phrase(KEYWORDS[name], rng).split()
+        rng.setstate(state)
+        sentence = passenger.say(name, rng).split()
+        assert [word for word in plain if word in MEANINGFUL] == [word for word in sentence if word in MEANINGFUL]
+        assert inside(sentence, plain)
+        terse[len(sentence) < len(plain)] += 1
+        assert sentence == plain or set(name.replace(",", " ").split()) <= set(sentence)
+    assert terse[True] > 60
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("first left", "go left as soon as you can"),  # nothing would be left but left
+        ("left,right", "go right once you have gone left"),
+        ("left", "do not go straight but left"),
+        ("right", "do not let this right go by"),
+        ("second left", "let the first left go by and take the second"),
+        ("left,left", "turn left and do the same at the next one"),
+    ],
+)
+def test_commands_that_need_all_their_words_keep_them(passenger, name, sentence):
+    words = sentence.split()
+    assert passenger._shorten(KEYWORDS[name], words, random.Random(0)) == words
+
+
+def test_a_shortened_command_does_not_turn_its_order_round(passenger):
+    words = ["left", "and", "right", "after", "that"]
+    heard = {" ".join(passenger._shorten(KEYWORDS["left,right"], words, random.Random(k))) for k in range(50)}
+    assert "left right" in heard
+    assert not any("after" in sentence for sentence in heard)
 
 
 def test_corrections_end_with_what_is_meant(passenger, monkeypatch, spoken):

@@ -6,6 +6,8 @@ import torch
 from ldrl.language import Tokenizer, WordEmbedding
 from ldrl.modules import ImageEncoder, InstructionEncoder
 
+LEARNED = {"learned", "forward_gru", "backward_gru"}
+
 
 @pytest.fixture
 def encoder():
@@ -63,7 +65,7 @@ def test_images_are_not_changed():
 
 
 def test_words_against_the_plain_recurrence(encoder):
-    tokens = Tokenizer(max_tokens=7)(["turn left", "take the second right please", "straight"])
+    tokens = Tokenizer(max_tokens=7)(["turn left", "take the second zebra please", "straight"])
     states, is_word = encoder(tokens)
     assert states.shape == (3, 7, 6)
     for gru, half in ((encoder.forward_gru, slice(0, 3)), (encoder.backward_gru, slice(3, 6))):
@@ -72,15 +74,31 @@ def test_words_against_the_plain_recurrence(encoder):
         for row, length in enumerate((2, 5, 1)):
             state = torch.zeros(1, 3)
             for k in range(length) if gru is encoder.forward_gru else reversed(range(length)):
-                # Word vectors that are learned: of those that decide, and zeros for all others.
-                which = (encoder.decisive_tokens == tokens[row, k]).nonzero().flatten()
-                learned = encoder.decisive.weight[which[0] + 1] if len(which) else torch.zeros(16)
+                # Vectors that are learned: of usual words, and zeros for all others.
+                which = (encoder.usual_tokens == tokens[row, k]).nonzero().flatten()
+                learned = encoder.learned.weight[which[0] + 1] if len(which) else torch.zeros(16)
                 vector = torch.cat((WordEmbedding()(tokens[row, k]), learned))
                 state = cell(vector.unsqueeze(0), state)
                 torch.testing.assert_close(states[row, k, half], state[0])
     for row, length in enumerate((2, 5, 1)):
         assert is_word[row].tolist() == [True] * length + [False] * (7 - length)
         assert not states[row, length:].any()
+
+
+def test_usual_words_have_a_learned_vector(encoder):
+    tokenizer = Tokenizer(max_tokens=1)
+    usual = tokenizer(["left", "right", "first", "second", "followed", "following", "the"])
+    assert torch.isin(usual, encoder.usual_tokens).all()
+    assert not torch.isin(tokenizer(["zebra", "zzyzzyx"]), encoder.usual_tokens).any()
+    assert len(encoder.usual_tokens.unique()) == 300
+    encoder.noise, encoder.dropout.p = 0.0, 1.0
+    first = encoder(usual)[0]
+    with torch.no_grad():
+        encoder.learned.weight[1:] += 1
+    assert not torch.equal(encoder(usual)[0], first)
+    # In training a share of them is left out; here all are, and GloVe's vectors with them.
+    encoder.train()
+    assert torch.equal(encoder(usual)[0][0], encoder(usual)[0][-1])
 
 
 def test_padding_and_batch_do_not_matter(encoder):
@@ -122,5 +140,5 @@ def test_words_are_disturbed_in_training_only(encoder):
 
 
 def test_word_vectors_are_not_trained_and_not_saved(encoder):
-    assert {name.split(".")[0] for name in encoder.state_dict()} == {"decisive", "forward_gru", "backward_gru"}
-    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == {"decisive", "forward_gru", "backward_gru"}
+    assert {name.split(".")[0] for name in encoder.state_dict()} == {"usual_tokens", *LEARNED}
+    assert {name.split(".")[0] for name, _ in encoder.named_parameters()} == LEARNED
