@@ -109,12 +109,15 @@ class InstructionEncoder(nn.Module):
     usual_tokens: Tensor
 
     def __init__(
-        self, hidden: int, noise: float = 0.15, dropout: float = 0.1, usual: int = 300, learned: int = 16
+        self, hidden: int, noise: float = 0.15, dropout: float = 0.1, usual: int = 1000, learned: int = 16
     ) -> None:
         super().__init__()
         self.embedding = WordEmbedding()
+        # Some words are read as others, so that there are fewer tokens than words.
+        words = training_words()
+        tokens = list(dict.fromkeys(Tokenizer(2 * len(words))([" ".join(words)])[0].tolist()))[:usual]
         # Saved with the weights: other training commands may have other usual words.
-        self.register_buffer("usual_tokens", Tokenizer(usual)([" ".join(training_words()[:usual])])[0].sort().values)
+        self.register_buffer("usual_tokens", torch.tensor(sorted(tokens)))
         self.learned = nn.Embedding(usual + 1, learned, padding_idx=0)
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
