@@ -17,9 +17,8 @@ from ldrl.envs.sight import HEIGHT, HORIZON, STEMS_IN_SIGHT, WIDTH, Mount, Sight
 from ldrl.towns import Town
 from ldrl.towns.ground import Material
 
-__all__ = ["DashCamera", "Modality", "shift"]
+__all__ = ["DashCamera", "shift"]
 
-Modality = Literal["gs", "rgb"]
 MOST_APPEARANCES = 1 << 60
 CHANNELS = {"gs": 1, "rgb": 3}
 """Channels of the image in each modality."""
@@ -84,7 +83,7 @@ class DashCamera(Transform):
         self,
         town: Town,
         *,
-        modality: Modality = "gs",
+        modality: Literal["gs", "rgb"] = "gs",
         appearance: str | int = "clear",
         lateral: float = 0.0,
         yaw: float = 0.0,

@@ -29,7 +29,7 @@ class Episode:
 
     Args:
         id: any string; reports return it unchanged.
-        town: name of the town; in a file, for a map that is not built in, the path of its ``.xodr`` file.
+        town: name of the town, such as ``"town1"`` or ``"random-7"``; in a file also the path of a ``.xodr`` file.
         keyword: what the instruction means.
         instruction: what the passenger says.
         start: x, y (m) and heading (rad).
@@ -170,9 +170,9 @@ def load_episodes(path: str | Path, towns: dict[str, Town] | None = None) -> lis
 
     Args:
         path: JSON lines, one episode each; blank lines are skipped.
-        towns: by name, to check every start and path against; None checks neither these nor the towns' names. A town
-            that ends in ``.xodr`` is the path of a map, relative to the folder of the episode file or absolute: it is
-            loaded, and added here under the name that the episodes give it.
+        towns: by name, to check every start and path against; None checks neither these nor the towns' names. Other
+            towns are loaded and added here under the name that the episodes give them. One that ends in ``.xodr`` is
+            the path of a map, relative to the folder of the episode file or absolute.
 
     Raises:
         ValueError: the file has no episode, or a line is broken, or its episode does not lie on the roads of its
@@ -215,9 +215,7 @@ def _parse(line: str) -> Episode:
 
 
 def _town(name: str, towns: dict[str, Town], folder: Path) -> Town:
-    """The town that an episode names; a map is loaded when it is first named."""
+    """The town that an episode names, loaded when it is first named."""
     if name not in towns:
-        if not name.endswith(".xodr"):
-            raise ValueError(f"unknown town {name!r}; use one of {', '.join(towns)}, or the path of a .xodr file")
-        towns[name] = Town(name, load_network(folder / name))
+        towns[name] = Town(name, load_network(folder / name)) if name.endswith(".xodr") else Town.load(name)
     return towns[name]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, GymWrapper, InitTracker, Transform, TransformedEnv
 
 from ldrl import keys
-from ldrl.envs.camera import DashCamera, Modality
+from ldrl.envs.camera import DashCamera
 from ldrl.envs.episodes import Episode
 from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
@@ -19,7 +20,9 @@ from ldrl.envs.segmenter import RoadSegmenter
 from ldrl.envs.town import TownEnv
 from ldrl.towns import Town
 
-__all__ = ["make_camera", "make_env", "make_highway_env"]
+__all__ = ["Modality", "make_camera", "make_env", "make_highway_env"]
+
+Modality = Literal["gs", "ps", "rgb"]
 
 
 def make_camera(town: Town, modality: Modality = "gs", *, appearance: str | int = "clear", seed: int = 0) -> Transform:

@@ -11,7 +11,7 @@ import pytest
 from ldrl.envs import Episode, builtin_episodes, load_episodes, save_episodes
 from ldrl.language import KEYWORDS, Family, Sentences
 from ldrl.subtasks import SubTask
-from ldrl.towns import plan_routes
+from ldrl.towns import Town, plan_routes
 
 LINE = {
     "id": "a",
@@ -105,6 +105,14 @@ def test_there_and_back(tmp_path, episodes):
     assert loaded == episodes["town2"]
     first = json.loads((tmp_path / "episodes.jsonl").read_text("utf-8").splitlines()[0])
     assert list(first) == ["id", "town", "keyword", "instruction", "start", "path"]
+
+
+def test_random_towns_are_made_when_they_are_named(tmp_path):
+    episodes = builtin_episodes(Town.load("random-7-4"), most_routes=1)
+    save_episodes(episodes, tmp_path / "e.jsonl")
+    towns = {}
+    assert load_episodes(tmp_path / "e.jsonl", towns) == episodes
+    assert towns.keys() == {"random-7-4"}
 
 
 def test_stops_are_said_and_nothing_else(tmp_path):
