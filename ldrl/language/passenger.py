@@ -36,7 +36,7 @@ MEANINGFUL = frozenset(
         "couple",
     ]
 )
-"""Words that say which way and how often; nothing random happens to them."""
+"""Words that say which way and how often: never dropped, replaced or stammered, but they may be misspelt."""
 FREQUENT = 20_000
 """How many of the most frequent words can be put into a sentence at random."""
 LOOSE = 0.6
@@ -105,10 +105,11 @@ class Passenger:
         for happened, change in zip(happens, changes, strict=True):
             if happened:
                 words = change(words, rng)
-        return " ".join(words) if 0 < len(words) <= self.max_words else plain
+        sentence = " ".join(words)
+        return sentence if 0 < len(sentence.split()) <= self.max_words else plain
 
     def nonsense(self, rng: random.Random) -> str:
-        """Known and unknown words at random, or talk that asks for nothing: 1 to 12 words."""
+        """Talk that asks for nothing, or 1 to 12 known and unknown words at random."""
         talk = rng.choice(_spoken()["slots"]["talk"])
         if len(talk.split()) > 2 and rng.random() < 0.3:
             return talk

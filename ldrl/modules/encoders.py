@@ -16,17 +16,16 @@ __all__ = ["ImageEncoder", "InstructionEncoder"]
 KERNELS = ((8, 4), (4, 2), (4, 2))
 """Kernel size and stride of each convolution (paper's implementation); 88x200 becomes 3x10, 48x200 becomes 1x10."""
 
-
-BUMPER = (slice(-10, None), slice(60, 140))
-"""Rows and columns of the image that show the road in front of the car, 2.5 to 4 m ahead."""
+ROAD_PATCH = (slice(-10, None), slice(60, 140))
+"""Rows and columns of the image that show the road just in front of the car, 4 to 5 m from the camera."""
 
 
 class ImageEncoder(nn.Module):
     """Three convolutions, each normalised over all channels and places (group norm of one group), with ELU.
 
-    Colours are taken relative to the mean colour of the road in front of the car and to the image's contrast, so that
-    neither the light nor the asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look from
-    that patch).
+    An image in colour is taken relative to the mean colour of the road in front of the car and to its own contrast, so
+    that neither the light nor the asphalt of a town matters much (as in Dahlkamp et al. 2006, who learn the road's look
+    from that patch).
 
     Args:
         in_channels: channels of the image.
@@ -79,7 +78,7 @@ class ImageEncoder(nn.Module):
     def _relative(self, image: Tensor) -> Tensor:
         """What the first convolution makes of ``(image - road) / contrast``, worked out on its fewer pixels."""
         first = self.layers[0]
-        road = image[..., *BUMPER].mean((-2, -1))
+        road = image[..., *ROAD_PATCH].mean((-2, -1))
         contrast = image[..., ::4, ::4].std((-3, -2, -1), keepdim=True) + 0.03
         absolute = functional.conv2d(image, first.weight, stride=first.stride)
         offset = road @ first.weight.sum((-2, -1)).T
@@ -103,7 +102,7 @@ class InstructionEncoder(nn.Module):
     Examples:
         >>> states, is_word = InstructionEncoder(32)(torch.tensor([[5, 6, 0, 0]]))
         >>> states.shape, is_word
-        (torch.Size([1, 4, 32]), tensor([[ True,  True, False, False]]))
+        (torch.Size([1, 2, 32]), tensor([[True, True]]))
     """
 
     usual_tokens: Tensor
@@ -132,8 +131,8 @@ class InstructionEncoder(nn.Module):
             tokens: ``[*B, L]`` int64, 0 is padding and only at the end.
 
         Returns:
-            The GRU's state after each word, ``[*B, L, hidden]`` float32, zero for padding, and where there is a
-            word, ``[*B, L]`` bool.
+            The GRU's state after each word, ``[*B, W, hidden]`` float32, zero for padding, and where there is a
+            word, ``[*B, W]`` bool; ``W`` is the number of words of the longest instruction, 1 if none has any.
         """
         length = (tokens != PADDING).sum(-1).flatten()
         longest = max([1, *length.tolist()])
@@ -150,5 +149,5 @@ class InstructionEncoder(nn.Module):
         onward, _ = self.forward_gru(vectors)
         backward, _ = self.backward_gru(vectors.take_along_dim(from_end, 1))
         states = torch.cat((onward, backward.take_along_dim(from_end, 1)), -1) * is_word.unsqueeze(-1)
-        states = functional.pad(states, (0, 0, 0, tokens.shape[-1] - longest))
-        return states.view(*tokens.shape, -1), tokens != PADDING
+        size = (*tokens.shape[:-1], longest)
+        return states.view(*size, states.shape[-1]), is_word.view(size)
