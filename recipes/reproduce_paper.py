@@ -8,9 +8,9 @@
 
 A cell is one training with its evaluation, or one evaluation, done by a command that one may also type; which ones
 there are is said in config/reproduce_paper.yaml. Cells go to runs/paper/seed<k>/<cell>/, with what they print in
-output.txt. A finished cell is not run again, unless its command or what it starts from has changed, so a run that was
-stopped goes on where it was: to make a cell anew after a change of the code, delete its folder. Figures of all seeds
-are kept in docs/results.json, from which the page is written.
+output.txt. A finished cell is not run again, unless its command, its settings or what it starts from has changed, so a
+run that was stopped goes on where it was: to make a cell anew after a change of the code, delete its folder. Figures of
+all seeds are kept in docs/results.json, from which the page is written.
 """
 
 from __future__ import annotations
@@ -47,6 +47,11 @@ TAIL = 15
 """Lines of a failed cell's output that are shown."""
 
 
+def digest(content: bytes) -> str:
+    """A short hash."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
 @dataclass(frozen=True)
 class Cell:
     """One training or evaluation.
@@ -54,12 +59,14 @@ class Cell:
     Args:
         folder: where its files go.
         recipe: a file of this folder.
+        settings: the files below ``config`` that it reads.
         arguments: of the recipe.
         needs: folders of the cells that must be finished before, whose checkpoints it takes.
     """
 
     folder: Path
     recipe: str
+    settings: tuple[str, ...]
     arguments: tuple[str, ...]
     needs: tuple[Path, ...]
 
@@ -70,10 +77,11 @@ class Cell:
 
     def origin(self) -> dict[str, Any]:
         """What it is made from: if this has changed, so has the cell."""
-        weights = (folder / WEIGHTS for folder in self.needs)
+        settings = [OmegaConf.to_container(OmegaConf.load(RECIPES / "config" / file)) for file in self.settings]
         return {
             "command": shlex.join(("python", f"recipes/{self.recipe}", *self.arguments)),
-            "weights": [hashlib.sha256(file.read_bytes()).hexdigest()[:16] for file in weights],
+            "settings": digest(json.dumps(settings).encode()),
+            "weights": [digest((folder / WEIGHTS).read_bytes()) for folder in self.needs],
         }
 
     def finished(self) -> bool:
@@ -82,9 +90,9 @@ class Cell:
         if not all((self.folder / file).is_file() for file in (MADE, REPORT, *weights)):
             return False
         made = json.loads((self.folder / MADE).read_text(encoding="utf-8"))
-        changed = [what for what, value in self.origin().items() if made[what] != value]
+        changed = [what for what, value in self.origin().items() if made.get(what) != value]
         if changed:
-            tqdm.write(f"{self.name}: its {' and '.join(changed)} changed, so it is made again")
+            tqdm.write(f"{self.name}: other {' and '.join(changed)} than before, so it is made again")
         return not changed
 
     def start(self, threads: int) -> subprocess.Popen:
@@ -113,14 +121,14 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
             given = dict(table[name])
             taken = tuple(folder / needed for needed in needs(given))
             if "checkpoint" in given:
-                recipe = EVALUATION
+                recipe, read = EVALUATION, ("evaluate.yaml",)
                 given |= {"checkpoint": taken[0], "out": folder / name / REPORT, **settings.evaluation}
             else:
-                recipe = TRAINING
+                recipe, read = TRAINING, ("bc_hierarchical.yaml", f"preset/{cfg.scale}.yaml", "size/small.yaml")
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
-            cells.append(Cell(folder / name, recipe, tuple(argument(*item) for item in given.items()), taken))
+            cells.append(Cell(folder / name, recipe, read, tuple(argument(*item) for item in given.items()), taken))
     return cells
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,7 @@ def _rate(records: Sequence[Mapping[str, Any]], measure: str) -> float:
 
 @cache
 def _has_four_way(town: str) -> bool:
-    layout = random_layout(int(town.removeprefix("random-")))
+    layout = random_layout(*map(int, town.removeprefix("random-").split("-")))
     return max(Counter(end for street in layout.streets for end in street).values()) > 3
 
 
@@ -95,13 +95,12 @@ def read_cells(folder: str | Path) -> list[Result]:
     """The finished cells in ``<folder>/seed<k>/<cell>/``."""
     found = []
     for made in sorted(Path(folder).glob(f"seed*/*/{MADE}")):
-        report = made.with_name(REPORT)
-        if report.is_file():
+        report, seed = made.with_name(REPORT), made.parent.parent.name.removeprefix("seed")
+        if report.is_file() and seed.isdecimal():
             about = json.loads(made.read_text(encoding="utf-8"))
-            del about["weights"]
+            about = {field.name: about[field.name] for field in fields(Result) if field.name in about}
             rates = measure(json.loads(report.read_text(encoding="utf-8"))["episodes"])
-            cell, seed = made.parent.name, int(made.parent.parent.name.removeprefix("seed"))
-            found.append(Result(cell, seed, **about, rates=rates))
+            found.append(Result(made.parent.name, int(seed), **about, rates=rates))
     return found
 
 

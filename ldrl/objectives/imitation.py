@@ -20,21 +20,33 @@ from ldrl.modules import HighLevelPolicy, InstructedPolicy, LowLevelPolicy, Sing
 __all__ = ["ControlLoss", "EndOfSubtaskLoss", "KeywordLoss", "SinglePolicyLoss", "SubtaskLoss"]
 
 
-class _LowLevelLoss(LossModule):
-    """A loss over slices of one low-level policy, which starts each slice from a zero state."""
+class _ImitationLoss(LossModule):
+    """A loss that reads what a policy is shown, ``shown``, and the keys that can be set."""
 
     policy: TensorDictModuleBase
     policy_params: TensorDictParams
     target_policy_params: TensorDictParams
 
-    def __init__(self, policy: LowLevelPolicy) -> None:
+    def __init__(self, policy: TensorDictModuleBase, shown: list[NestedKey]) -> None:
         super().__init__()
-        self._in_keys = None
-        self.state_key, self.hidden = policy.state_key, policy.hidden
+        self.shown = shown
         self.convert_to_functional(policy, "policy", create_target_params=False)
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What the loss reads."""
+        return [*self.shown, *vars(self.tensor_keys).values()]
+
+
+class _LowLevelLoss(_ImitationLoss):
+    """A loss over slices of one low-level policy, which starts each slice from a zero state."""
+
+    def __init__(self, policy: LowLevelPolicy) -> None:
+        super().__init__(policy, [keys.IMAGE])
+        self.state_key, self.hidden = policy.state_key, policy.hidden
+
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
-        inputs = tensordict.select(keys.IMAGE)
+        inputs = tensordict.select(*self.shown)
         inputs[keys.AGENT_SUBTASK] = tensordict[self.tensor_keys.subtask]
         inputs[self.state_key] = torch.zeros(*tensordict.shape, self.hidden, device=tensordict.device)
         with self.policy_params.to_module(self.policy), set_recurrent_mode(True):
@@ -92,7 +104,7 @@ class EndOfSubtaskLoss(_LowLevelLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_end_of_subtask"]  # noqa: RUF012
+    out_keys = ["loss_end_of_subtask", "accuracy_end_of_subtask"]  # noqa: RUF012
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss.
@@ -110,7 +122,7 @@ class EndOfSubtaskLoss(_LowLevelLoss):
         return TensorDict({"loss_end_of_subtask": loss, "accuracy_end_of_subtask": accuracy})
 
 
-class KeywordLoss(LossModule):
+class KeywordLoss(_ImitationLoss):
     """Cross entropy of the keyword that a sentence means, told from what a policy reads in it.
 
     Sentences cost much less than images, so many more of them can be learned from before the policy learns to act.
@@ -125,16 +137,11 @@ class KeywordLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_keyword"]  # noqa: RUF012
-    reader: TensorDictModuleBase
-    reader_params: TensorDictParams
-    target_reader_params: TensorDictParams
+    out_keys = ["loss_keyword", "accuracy_keyword"]  # noqa: RUF012
 
     def __init__(self, policy: InstructedPolicy) -> None:
-        super().__init__()
-        self._in_keys = None
+        super().__init__(policy.reader, [keys.INSTRUCTION_TOKENS])
         self.hidden = policy.hidden
-        self.convert_to_functional(policy.reader, "reader", create_target_params=False)
         self.head = nn.Linear(policy.said_size, len(KEYWORDS) + 1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -147,17 +154,17 @@ class KeywordLoss(LossModule):
         Returns:
             ``loss_keyword``, a scalar, and ``accuracy_keyword``, the share of sentences understood.
         """
-        inputs = tensordict.select(keys.INSTRUCTION_TOKENS).flatten()
+        inputs = tensordict.select(*self.shown).flatten()
         inputs[keys.HIGH_LEVEL_STATE] = torch.zeros(len(inputs), self.hidden, device=tensordict.device)
-        with self.reader_params.to_module(self.reader):
-            logits = self.head(self.reader(inputs)[keys.SAID])
+        with self.policy_params.to_module(self.policy):
+            logits = self.head(self.policy(inputs)[keys.SAID])
         target = tensordict[self.tensor_keys.keyword].flatten()
         loss = functional.cross_entropy(logits, target)
         accuracy = (logits.argmax(-1) == target).float().mean()
         return TensorDict({"loss_keyword": loss, "accuracy_keyword": accuracy})
 
 
-class SubtaskLoss(LossModule):
+class SubtaskLoss(_ImitationLoss):
     """Cross entropy of the high-level policy over sequences of decisions; padding counts for nothing.
 
     Args:
@@ -171,22 +178,18 @@ class SubtaskLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_subtask"]  # noqa: RUF012
-    policy: TensorDictModuleBase
-    policy_params: TensorDictParams
-    target_policy_params: TensorDictParams
+    out_keys = ["loss_subtask", "accuracy_subtask"]  # noqa: RUF012
 
     def __init__(self, policy: HighLevelPolicy) -> None:
-        super().__init__()
-        self._in_keys = None
-        self.convert_to_functional(policy, "policy", create_target_params=False)
+        super().__init__(policy, [key for key in policy.in_keys if key != keys.HIGH_LEVEL_STATE])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss.
 
         Args:
-            tensordict: sequences of decisions, batch size ``[B, D]``: image, instruction tokens, ``("agent",
-            "previous_subtask")``, the right ``subtask``, and ``mask``, False for padding, which is at the end.
+            tensordict: sequences of decisions, batch size ``[B, D]``: image, instruction tokens,
+                ``("agent", "previous_subtask")``, the right ``subtask``, and ``mask``, False for padding, which is at
+                the end.
 
         Returns:
             ``loss_subtask``, a scalar, zero where all is padding, and ``accuracy_subtask``, the share of
@@ -194,7 +197,7 @@ class SubtaskLoss(LossModule):
         """
         mask, subtask = tensordict[self.tensor_keys.mask], self.tensor_keys.subtask
         with self.policy_params.to_module(self.policy):
-            made = unroll(self.policy, tensordict.select(*self.policy.in_keys, subtask, strict=False), mask)
+            made = unroll(self.policy, tensordict.select(*self.shown, subtask), mask)
         target, logits = made[subtask], made[keys.SUBTASK_LOGITS]
         decisions = max(len(target), 1)
         loss = functional.cross_entropy(logits, target, reduction="sum") / decisions
@@ -202,7 +205,7 @@ class SubtaskLoss(LossModule):
         return TensorDict({"loss_subtask": loss, "accuracy_subtask": accuracy})
 
 
-class SinglePolicyLoss(LossModule):
+class SinglePolicyLoss(_ImitationLoss):
     """L1 between a single policy's action and the expert's over whole drives; padding counts for nothing.
 
     A policy with history is told the expert's action of the step before.
@@ -219,14 +222,9 @@ class SinglePolicyLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = ["loss_action"]  # noqa: RUF012
-    policy: TensorDictModuleBase
-    policy_params: TensorDictParams
-    target_policy_params: TensorDictParams
 
     def __init__(self, policy: SinglePolicy) -> None:
-        super().__init__()
-        self._in_keys = None
-        self.convert_to_functional(policy, "policy", create_target_params=False)
+        super().__init__(policy, [keys.IMAGE, keys.INSTRUCTION_TOKENS])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss.
@@ -239,7 +237,7 @@ class SinglePolicyLoss(LossModule):
             ``loss_action``, a scalar, zero where all is padding.
         """
         target = tensordict[self.tensor_keys.action]
-        inputs = tensordict.select(keys.IMAGE, keys.INSTRUCTION_TOKENS)
+        inputs = tensordict.select(*self.shown)
         inputs["target"] = target
         inputs[keys.PREVIOUS_ACTION] = functional.pad(target[:, :-1], (0, 0, 1, 0))
         with self.policy_params.to_module(self.policy):

@@ -8,18 +8,26 @@ from tensordict import TensorDict
 
 from ldrl import keys
 from ldrl.language import KEYWORDS, Tokenizer
-from ldrl.modules import NO_SUBTASK, AgentConfig, HierarchicalAgent
-from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SubtaskLoss
+from ldrl.modules import NO_SUBTASK, AgentConfig, HierarchicalAgent, SingleAgent
+from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 
+SIZES = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "instruction_hidden": 6}
+SIZES |= {"subtask_embedding": 3, "high_level_hidden": 7}
 SENTENCES = ("turn left", "take the second right", "straight", "left and then straight please")
 
 
 @pytest.fixture
 def agent():
-    sizes = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "instruction_hidden": 6}
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return HierarchicalAgent(AgentConfig(**sizes, subtask_embedding=3, high_level_hidden=7)).eval()
+        return HierarchicalAgent(AgentConfig(**SIZES)).eval()
+
+
+@pytest.fixture(params=["single", "single-history"])
+def single(request):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return SingleAgent(AgentConfig(model=request.param, **SIZES)).eval()
 
 
 @pytest.fixture
@@ -50,6 +58,12 @@ def decisions(images):
     td[keys.PREVIOUS_SUBTASK] = torch.cat((torch.full((4, 1), NO_SUBTASK), td[keys.SUBTASK][:, :-1]), 1)
     td["mask"] = torch.arange(5) < torch.tensor([[5], [3], [1], [2]])
     return td
+
+
+@pytest.fixture
+def drives(slices, decisions):
+    """Four drives of at most five frames: 5, 3, 1 and 2 of them."""
+    return slices.select(keys.IMAGE, keys.ACTION).update(decisions.select(keys.INSTRUCTION_TOKENS, "mask"))
 
 
 def outputs(policy, data, key):
@@ -226,6 +240,7 @@ def test_keyword_loss_is_the_plain_computation(agent):
 
 
 def test_keyword_loss_trains_what_reads(agent):
+    before = {name: value.clone() for name, value in agent.high_level.reader.named_parameters()}
     loss = KeywordLoss(agent.high_level)
     data = TensorDict({keys.INSTRUCTION_TOKENS: Tokenizer()(SENTENCES), keys.KEYWORD: torch.arange(4)}, [4])
     optimizer = torch.optim.Adam(loss.parameters(), 0.02)
@@ -237,8 +252,55 @@ def test_keyword_loss_trains_what_reads(agent):
         optimizer.zero_grad()
     assert losses[-1] < 0.3 * losses[0]
     assert loss(data)["accuracy_keyword"] == 1
-    trained = {name for name, parameter in agent.high_level.named_parameters() if parameter.requires_grad}
-    assert any(name.startswith("module.0.module.forward_gru") for name in trained)
+    # The agent's own parameters are trained; but what asks for words, and the query of a zero state is zero.
+    trained = {
+        name for name, value in agent.high_level.reader.named_parameters() if not torch.equal(value, before[name])
+    }
+    assert trained == before.keys() - {"module.1.module.score.weight"}
+
+
+def test_single_policy_loss_is_the_plain_computation(single, drives):
+    gaps = []
+    for row, length in enumerate((5, 3, 1, 2)):
+        state, before = torch.zeros(1, 7), torch.zeros(1, 2)
+        for step in range(length):
+            td = drives[row, step].unsqueeze(0).select(keys.IMAGE, keys.INSTRUCTION_TOKENS)
+            td[keys.HIGH_LEVEL_STATE], td[keys.PREVIOUS_ACTION] = state, before
+            single.policy(td)
+            state, before = td["next", *keys.HIGH_LEVEL_STATE], drives[keys.ACTION][row, step : step + 1]
+            gaps += (td[keys.ACTION] - before).abs().flatten().tolist()
+    found = SinglePolicyLoss(single.policy)(drives)["loss_action"]
+    assert float(found.detach()) == pytest.approx(sum(gaps) / len(gaps), rel=1e-5)
+
+
+def test_padding_of_drives_counts_for_nothing(single, drives):
+    loss = SinglePolicyLoss(single.policy)
+    expected = loss(drives)["loss_action"]
+    padding = ~drives["mask"]
+    drives[keys.IMAGE][padding] = 255
+    drives[keys.ACTION][padding] = 1e9
+    assert torch.equal(loss(drives)["loss_action"], expected)
+    drives["mask"] = torch.zeros_like(padding)
+    assert loss(drives)["loss_action"] == 0
+
+
+def test_losses_say_what_they_read_and_write(agent, single, slices, decisions, drives):
+    words = TensorDict({keys.INSTRUCTION_TOKENS: Tokenizer()(SENTENCES), keys.KEYWORD: torch.arange(4)}, [4])
+    for loss, data in (
+        (ControlLoss(agent.control), slices),
+        (EndOfSubtaskLoss(agent.end_of_subtask), slices),
+        (KeywordLoss(agent.high_level), words),
+        (SubtaskLoss(agent.high_level), decisions),
+        (SinglePolicyLoss(single.policy), drives),
+    ):
+        assert set(loss(data.select(*loss.in_keys)).keys()) == set(loss.out_keys)
+        for key in loss.in_keys:
+            with pytest.raises(KeyError):
+                loss(data.exclude(key))
+        name, key = next(iter(vars(loss.tensor_keys).items()))
+        loss.set_keys(**{name: "mine"})
+        assert "mine" in loss.in_keys
+        assert key not in loss.in_keys
 
 
 @pytest.mark.parametrize(

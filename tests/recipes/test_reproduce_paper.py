@@ -117,8 +117,8 @@ def test_a_cell_whose_command_changed_is_made_again_with_what_starts_from_it(rep
     made, error, printed = reproduce(*changed)
     assert error is None
     assert made == ["seed0/gs-hi", "seed0/gs-hi-misleading"]
-    assert "seed0/gs-hi: its command changed, so it is made again" in printed
-    assert "seed0/gs-hi-misleading: its weights changed, so it is made again" in printed
+    assert "seed0/gs-hi: other command than before, so it is made again" in printed
+    assert "seed0/gs-hi-misleading: other weights than before, so it is made again" in printed
     assert reproduce(*changed)[0] == []
 
 
