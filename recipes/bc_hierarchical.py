@@ -2,10 +2,10 @@
 
     python recipes/bc_hierarchical.py                          # a laptop's preset: the full model on gs
     python recipes/bc_hierarchical.py preset=smoke             # everything once, to see it run
-    python recipes/bc_hierarchical.py model=single-history     # another of the paper's models
-    python recipes/bc_hierarchical.py modality=rgb              # from colour images
-    python recipes/bc_hierarchical.py misleading=0.25          # trained for directions that the map does not allow
-    python recipes/bc_hierarchical.py model=hi stages=[language,high_level] start_from.low_level=runs/hih  # not anew
+    python recipes/bc_hierarchical.py name=h0 model=h0             # another of the paper's models
+    python recipes/bc_hierarchical.py name=rgb modality=rgb        # from colour images
+    python recipes/bc_hierarchical.py name=safe misleading=0.25    # trained for what the map does not allow
+    python recipes/bc_hierarchical.py name=hi model=hi stages=[language,high_level] start_from.low_level=runs/h0
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """
@@ -51,7 +51,7 @@ from ldrl.modules import MODELS, Agent, AgentConfig, HierarchicalAgent, load_age
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 from ldrl.towns import Town
 
-STAGES = ("language", "low_level", "high_level")
+STAGES = ("low_level", "language", "high_level")  # the first soon shows whether all settings fit
 
 
 class Training:
@@ -64,6 +64,7 @@ class Training:
         shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
         self.logger = CSVLogger("log", str(folder))
         self.history: dict[str, list[float]] = {}
+        self.batches: dict[str, int] = {}
 
     @cached_property
     def driven(self) -> list[tuple[Town, Buffer, int]]:
@@ -98,6 +99,7 @@ class Training:
                 history[name].append(value)
                 self.logger.log_scalar(name, value, step)
         self.history |= history
+        self.batches[title] = steps
 
     def views(self, samplers: Sequence[Sampler], frames: int, length: int, **disturbed: float) -> list[Buffer]:
         """For each town a buffer over its demonstrations that draws images, seen from disturbed poses, when sampled."""
@@ -175,6 +177,16 @@ def start_from(agent: Agent, checkpoints: Mapping[str, str | None]) -> list[str]
     return copied
 
 
+def check(cfg: DictConfig) -> None:
+    """Raise a ValueError for settings of which nothing can be made."""
+    for name in ("towns", "test_towns", "stages"):
+        if not OmegaConf.is_list(cfg[name]):
+            raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
+    unknown = set(cfg.stages) - set(STAGES)
+    if unknown:
+        raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
+
+
 def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
     """The built-in episodes of both towns, misleading ones if trained for, all or the first few of each keyword."""
     episodes, seen = [], defaultdict(int)
@@ -186,15 +198,14 @@ def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
     return episodes
 
 
-def write_report(cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: Path, training: str) -> None:
-    """Evaluate, and write what came of it."""
+def write_report(
+    cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: Path, batches: dict[str, int], training: str
+) -> None:
+    """Evaluate, and write what came of it and of how many batches in which time."""
     began = time.perf_counter()
     episodes = choose_episodes(cfg, towns)
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
         outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
-    batches = {stage: cfg[f"{stage}_steps"] for stage in cfg.stages}
-    if not isinstance(agent, HierarchicalAgent):
-        batches = {stage: cfg.drives_steps if stage == "high_level" else n for stage, n in batches.items()}
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
         "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}; "
@@ -222,9 +233,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     folder = Path("runs") / str(cfg.name)
     try:
-        unknown = set(cfg.stages) - set(STAGES)
-        if unknown:
-            raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
+        check(cfg)
         towns = {town.name: town for town in map(Town.load, cfg.test_towns)}
         sizes = OmegaConf.to_container(cfg.size)
         if cfg.misleading and not MODELS[cfg.model].hierarchical:
@@ -233,21 +242,25 @@ def main(cfg: DictConfig) -> None:
         if any(cfg.start_from.values()):
             copied = start_from(agent, cfg.start_from)
             print(f"Taken from trained agents: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        make_camera(next(iter(towns.values())), cfg.modality, appearance=cfg.appearance)
         training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")
-    except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
+    except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
 
     began = time.perf_counter()
-    for stage in STAGES:
-        if stage in cfg.stages and not (stage == "low_level" and not isinstance(agent, HierarchicalAgent)):
-            getattr(training, stage)()
+    try:
+        for stage in STAGES:
+            if stage in cfg.stages and not (stage == "low_level" and not isinstance(agent, HierarchicalAgent)):
+                getattr(training, stage)()
+    except ValueError as error:  # too few demonstrations, or a batch that does not divide
+        sys.exit(f"error: {error}")
     save_agent(agent, folder)
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}
     if losses:
         plot_losses(losses, folder / "losses.png")
-    write_report(cfg, agent, towns, folder, f"{time.perf_counter() - began:.0f} s")
+    write_report(cfg, agent, towns, folder, training.batches, f"{time.perf_counter() - began:.0f} s")
 
 
 if __name__ == "__main__":

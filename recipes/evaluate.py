@@ -74,7 +74,7 @@ def main(cfg: DictConfig) -> None:
         DashCamera(next(iter(first[0].values())), appearance=cfg.appearance)
         if cfg.out is not None:
             check_writable(str(cfg.out))
-    except (OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
+    except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
     settings = {"num_cars": cfg.num_cars, "appearance": cfg.appearance, "device": cfg.device}
     outcomes = []

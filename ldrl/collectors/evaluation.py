@@ -113,9 +113,9 @@ def evaluate(
                 town,
                 episodes=[episodes[i] for i in batch],
                 policy=actor,
-                modality=getattr(actor, "modality", "gs"),
                 appearance=appearance,
                 device=device,
+                seed=start,
             )
             for i, outcome in zip(batch, _drive(env, actor, [episodes[i] for i in batch]), strict=True):
                 outcomes[i] = outcome

@@ -52,7 +52,7 @@ def make_env(
     *,
     episodes: Sequence[Episode] | None = None,
     policy: TensorDictModuleBase | None = None,
-    modality: Modality = "gs",
+    modality: Modality | None = None,
     appearance: str | int = "clear",
     max_steps: int = 1000,
     traffic: int = 0,
@@ -66,7 +66,7 @@ def make_env(
         num_cars: the batch size; left out when ``episodes`` are given.
         episodes: one per row, with their instructions; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
-        modality: of the images, see :func:`make_camera`.
+        modality: of the images, see :func:`make_camera`; None for what the policy is made for, or ``"gs"``.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
         max_steps: length of a roaming episode.
         traffic: other cars in each world.
@@ -87,7 +87,7 @@ def make_highway_env(
     *,
     episode: Episode | None = None,
     policy: TensorDictModuleBase | None = None,
-    modality: Modality = "gs",
+    modality: Modality | None = None,
     appearance: str | int = "clear",
     config: dict | None = None,
     seed: int = 0,
@@ -98,7 +98,7 @@ def make_highway_env(
         town: a town, the name of one or the path of an OpenDRIVE map.
         episode: with its instruction; None roams and draws training sentences.
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
-        modality: of the images, see :func:`make_camera`.
+        modality: of the images, see :func:`make_camera`; None for what the policy is made for, or ``"gs"``.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
         config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
         seed: of the env, the instructions and the appearances.
@@ -118,14 +118,15 @@ def _stack(
     town: Town,
     episodes: Sequence[Episode] | None,
     policy: TensorDictModuleBase | None,
-    modality: Modality,
+    modality: Modality | None,
     appearance: str | int,
     seed: int,
 ) -> TransformedEnv:
     said = None if episodes is None else [episode.instruction for episode in episodes]
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
-        transforms.append(make_camera(town, modality, appearance=appearance, seed=seed).to(env.device))
+        shown = getattr(policy, "modality", "gs") if modality is None else modality
+        transforms.append(make_camera(town, shown, appearance=appearance, seed=seed).to(env.device))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms += [InitTracker(), policy.make_tensordict_primer()]
     return TransformedEnv(env, Compose(*transforms))

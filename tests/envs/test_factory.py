@@ -6,9 +6,9 @@ from torchrl.envs.utils import check_env_specs
 
 from ldrl import keys
 from ldrl.collectors.expert import Expert
-from ldrl.envs import DashCamera, make_env, make_highway_env
+from ldrl.envs import DashCamera, RoadSegmenter, make_env, make_highway_env
 from ldrl.language import Tokenizer
-from ldrl.modules import HierarchicalAgent
+from ldrl.modules import AgentConfig, HierarchicalAgent
 
 OBSERVED = (keys.IMAGE, keys.INSTRUCTION_TOKENS, keys.SUBTASK, keys.END_OF_SUBTASK, keys.POSE)
 
@@ -66,6 +66,15 @@ def test_town_by_name():
     assert env.base_env.town.name == "town2"
     with pytest.raises(ValueError, match=r"'atlantis'.*town1, town2"):
         make_env("atlantis", num_cars=1)
+
+
+@pytest.mark.parametrize(("modality", "channels"), [("gs", 1), ("ps", 1), ("rgb", 3)])
+def test_a_policy_sees_what_it_is_made_for(town2, modality, channels):
+    agent = HierarchicalAgent(AgentConfig(modality=modality, conv_channels=(2, 3, 4)))
+    for env in (make_env(town2, 1, policy=agent), make_highway_env(town2, policy=agent)):
+        assert env.reset()[keys.IMAGE].shape[-3] == channels
+        assert any(isinstance(module, RoadSegmenter) for module in env.transform.modules()) == (modality == "ps")
+    assert make_env(town2, 1, policy=agent, modality="rgb").reset()[keys.IMAGE].shape[-3] == 3
 
 
 @pytest.mark.parametrize("modality", ["gs", "rgb"])

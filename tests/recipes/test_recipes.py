@@ -292,6 +292,12 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
     ("arguments", "message"),
     [
         (["towns=[atlantis]"], "'atlantis'"),
+        (["towns=town1"], "towns is 'town1'; give a list, such as towns=[town1]"),
+        (["stages=language"], "stages is 'language'; give a list, such as stages=[language]"),
+        (["stages=[language,drawing]"], "stages has 'drawing'; use some of low_level, language, high_level"),
+        (["model=single", "misleading=0.25"], "misleading is 0.25 for model single, which cannot stop; set it to 0"),
+        (["start_from.low_level=atlantis"], "no checkpoint 'atlantis'"),
+        (["modality=rgb", "appearance=hail"], "weather 'hail' is unknown; use one of clear"),
         (["test_towns=[town2,atlantis]"], "'atlantis'"),
         (["size.features=0"], "features is 0; give a whole number above 0"),
         (["size.image_rows=10"], "rows is 10"),
@@ -304,6 +310,40 @@ def test_bad_arguments_of_training(tmp_path, call, arguments, message):
     assert message in error
     assert "\n" not in error
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("demonstration_frames=1000", "1000 frames do not divide among 128 cars"),
+        ("batch_slices=6", "use a multiple of"),
+    ],
+)
+def test_settings_that_do_not_fit_show_before_the_sentences_are_learned(tmp_path, call, argument, message):
+    printed, error = call("bc_hierarchical.py", *BRIEF, *TINY, argument, cwd=tmp_path)
+    assert str(error).startswith("error: ")
+    assert message in error
+    assert "language:" not in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "trained_on", "beside"),
+    [
+        (["model=single"], "language: 20 batches; drives: 2 batches", "single, gs"),
+        (["modality=rgb", "misleading=0.25", "stages=[high_level]"], "high_level: 2 batches", "hih, rgb"),
+    ],
+)
+def test_other_models_images_and_instructions(trained, tmp_path, call, arguments, trained_on, beside):
+    cwd, _ = trained
+    start_from = f"start_from.high_level={cwd}/runs/brief"
+    some = ("name=other", "drives_steps=2", "batch_drives=2", "drive_length=20", "test_towns=[town2]")
+    printed, error = call("bc_hierarchical.py", *BRIEF, *TINY, *some, *arguments, start_from, cwd=tmp_path)
+    assert error is None
+    assert "Taken from trained agents: " in printed
+    report = " ".join((tmp_path / "runs" / "other" / "report.md").read_text().replace("\\", "").split())
+    assert f"{trained_on} |" in report
+    assert f"| {beside} |" in report
+    assert load_agent(tmp_path / "runs" / "other")
 
 
 def test_unwritable_run_folder(tmp_path, call):
