@@ -33,7 +33,7 @@ class Result:
         cell: its name.
         seed: of the training.
         command: what made it.
-        began: seconds since 1970; 0 where nobody timed it, as when the command was typed by hand.
+        began: seconds since 1970.
         seconds: how long it took.
         hardware: and how many cells ran side by side.
         versions: of Python and torch.

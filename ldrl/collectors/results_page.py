@@ -146,11 +146,11 @@ def _described(target: Target) -> tuple[str, str, str, str]:
 
 
 def _targets(results: Results) -> str:
-    lines = [("model", "town", "type", "measure", "ours", "at least", "reached")]
+    lines = [("model", "town", "type", "measure", "ours", "at least", "reached", "seeds")]
     for target in TARGETS:
         values = results.values(*target[:4])
         reached = "-" if not values else "yes" if round(mean(values), 3) >= target.least else "no"
-        lines.append((*_described(target), _spread(values), f"{target.least:.3f}", reached))
+        lines.append((*_described(target), _spread(values), f"{target.least:.3f}", reached, str(len(values))))
     return markdown_table(lines, left=4)
 
 
@@ -221,7 +221,7 @@ def _segmenter(report: Mapping[str, Any]) -> str:
 def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:
     known = [result for result in results if result.cell in cells]
     for seed in results.seeds:
-        timed = [result for result in known if result.seed == seed and result.began]
+        timed = [result for result in known if result.seed == seed]
         clock, added = (f"{seconds / 60:.0f}" for seconds in (_busy(timed), sum(result.seconds for result in timed)))
         yield f"Seed {seed}: {len(timed)} of {len(cells)} cells took {clock} minutes by the clock, {added} added up."
     for what in ("hardware", "versions"):
@@ -229,10 +229,10 @@ def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:
     lines, commands = [("cell", "minutes", "seeds")], []
     for cell in cells:
         made = results.of(cell)
-        lines.append((cell, _spread([result.seconds / 60 for result in made if result.began], 1), str(len(made))))
+        lines.append((cell, _spread([result.seconds / 60 for result in made], 1), str(len(made))))
         commands += [result.command for result in made]
     yield markdown_table(lines, left=1)
-    yield 'A "-" with a seed is a cell whose command was typed by hand, which nobody timed. The commands:'
+    yield "The commands:"
     yield "\n".join(("```", *commands, "```"))
 
 

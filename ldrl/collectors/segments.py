@@ -20,7 +20,7 @@ from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
 
-__all__ = ["BoundarySampler", "Segment", "find_segments"]
+__all__ = ["BoundarySampler", "Segment", "find_misleading", "find_segments"]
 
 START = (-70, 16)
 """Frames around the begin of the first manoeuvre in which most instructions are given: from 39 m before it to 3 m into

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -125,7 +125,7 @@ def _stack(
     said = None if episodes is None else [episode.instruction for episode in episodes]
     transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
     if policy is None or keys.IMAGE in policy.in_keys:
-        shown = getattr(policy, "modality", "gs") if modality is None else modality
+        shown: Any = getattr(policy, "modality", "gs") if modality is None else modality
         transforms.append(make_camera(town, shown, appearance=appearance, seed=seed).to(env.device))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms += [InitTracker(), policy.make_tensordict_primer()]

@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache
+from functools import lru_cache
 
 import torch
 from rapidfuzz import process
@@ -28,6 +28,9 @@ RARE = 30_000
 """Words beyond this rank in GloVe are read as a word of a command that they resemble: "frst", "rihgt"."""
 EDITS = {4: 1, 5: 1}
 """How many letters may differ by the word's length: none in shorter words, two in longer ones."""
+
+LONGEST = 40
+"""Letters of what can be read as a word or two: no two words of commands are longer."""
 
 NUMERALS = {"1": "one", "2": "two", "1st": "first", "2nd": "second", "1x": "once", "2x": "twice"}
 """How often and which one in figures, and in words."""
@@ -64,10 +67,12 @@ def _is_symbol(character: str) -> bool:
     return not character.isascii() and unicodedata.category(character) in ("So", "Sm", "Sc")
 
 
-@cache
+@lru_cache(maxsize=2**16)
 def _read_as(word: str) -> tuple[str, ...]:
     """The words of commands that a misspelt or run-together word stands for; none where it resembles nothing."""
     known = training_words()
+    if len(word) > LONGEST:
+        return ()
     for parts in ((word[:k], word[k:]) for k in range(1, len(word))):
         if all(part in known and (len(part) > 1 or part in "ai") for part in parts):
             return parts
@@ -128,7 +133,7 @@ class Tokenizer:
 
     def _row(self, sentence: str) -> list[int]:
         vocabulary = self.glove.words
-        said = normalise(sentence)
+        said = normalise(sentence)[: self.max_tokens]
         if not said:
             raise ValueError(f"the instruction {sentence!r} has no word: say what to do, for example 'turn left'")
         rare = [vocabulary.get(word, RARE) >= RARE for word in said]

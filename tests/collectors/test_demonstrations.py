@@ -15,11 +15,11 @@ def expert(town, stored):
     return expert_action(town, stored[keys.POSE], speed, stored[keys.ROUTE], position)
 
 
-def test_at_most_100_bytes_a_frame(town2, tmp_path):
+def test_68_bytes_a_frame(town2, tmp_path):
     buffer = collect_demonstrations(town2, 400, num_cars=4, path=tmp_path)
     stored = buffer.storage[:]
     size = sum(value.numel() * value.element_size() for value in stored.values(True, True))
-    assert size <= 100 * len(buffer)
+    assert size == 68 * len(buffer)
     files = sum(path.stat().st_size for path in tmp_path.rglob("*.memmap"))
     assert files <= 100 * len(buffer)
     assert files >= 32 * len(buffer)  # they are there

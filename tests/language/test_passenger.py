@@ -201,10 +201,13 @@ def test_slips_change_a_letter_or_take_a_word_for_another(passenger, monkeypatch
     assert counts[True] > 100
 
 
-def test_nonsense_never_commands(passenger):
+def test_nonsense_never_commands(passenger, spoken):
     rng = random.Random(0)
-    commands = set(Sentences("train").all("left")) | set(Sentences("train").all("straight"))
-    assert not commands.intersection(passenger.nonsense(rng) for _ in range(2000))
+    assert MEANINGFUL.isdisjoint(passenger._words)
+    nonsense = {passenger.nonsense(rng) for _ in range(2000)}
+    assert nonsense.isdisjoint(sentence for name in KEYWORDS for sentence in Sentences("train").all(name))
+    random_words = nonsense - set(spoken["slots"]["talk"])
+    assert MEANINGFUL.isdisjoint(word for sentence in random_words for word in sentence.split())
 
 
 def test_training_words_are_known_and_start_with_the_meaningful():

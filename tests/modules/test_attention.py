@@ -5,6 +5,7 @@ import math
 import torch
 
 from ldrl.modules import GatedAttention, LuongAttention
+from ldrl.modules.attention import Concatenation, LastWord
 
 
 def words(lengths, longest=5, size=3, seed=0):
@@ -102,3 +103,18 @@ def test_gate_is_the_plain_loop():
                 score = (gate.gate.weight[channel] @ condition[i, j] + gate.gate.bias[channel]).item()
                 weight = 1 / (1 + math.exp(-score))
                 torch.testing.assert_close(found[i, j, channel], features[i, j, channel] * weight)
+
+
+def test_last_word_is_where_each_direction_ends():
+    states, is_word = words((0, 1, 3, 5), size=4)
+    found = LastWord()(states, is_word)
+    assert not found[0].any()
+    for row, last in ((1, 0), (2, 2), (3, 4)):
+        assert found[row].tolist() == [*states[row, last, :2].tolist(), *states[row, 0, 2:].tolist()]
+    assert torch.equal(LastWord()(states.view(2, 2, 5, 4), is_word.view(2, 2, 5)), found.view(2, 2, 4))
+
+
+def test_concatenation_is_flat():
+    image, said = torch.randn(2, 3, 4, 5), torch.randn(2, 6)
+    found = Concatenation()(image, said)
+    assert torch.equal(found, torch.cat((image.flatten(1), said), 1))

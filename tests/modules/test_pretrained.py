@@ -1,10 +1,11 @@
-"""The checkpoint that ships with the package drives."""
+"""The checkpoints that ship with the package drive."""
 
 import dataclasses
 
 import pytest
 
 from ldrl.collectors import evaluate
+from ldrl.envs.segmenter import SHIPPED
 from ldrl.language import KEYWORDS
 from ldrl.modules import PRETRAINED, HierarchicalAgent, resolve_checkpoint
 
@@ -18,7 +19,7 @@ def agents():
 
 def test_ship_with_their_reports_and_are_small():
     assert tuple(f"hierarchical-{modality}" for modality in MODALITIES) == PRETRAINED
-    sizes = 0
+    sizes = sum(file.stat().st_size for file in SHIPPED.rglob("*"))  # the segmenter of ps
     for name in PRETRAINED:
         files = {file.name: file.stat().st_size for file in resolve_checkpoint(name).iterdir()}
         assert {"agent.safetensors", "agent.json", "report.md"} <= set(files)
