@@ -155,8 +155,8 @@ def test_targets_are_judged_by_the_mean():
     two = [result("gs-hih", seed, rates(each, 0.97)) for seed, each in enumerate((0.99, 1.0))]
     text = section(results_page(Results(two), [], SEGMENTER), "What should be reached")
     assert row(text, "Hih, gs", "Town 2", "all", "success")[4:] == ["0.995 (0.990 to 1.000)", "0.995", "yes", "2"]
-    assert row(text, "Hih, gs", "Town 1", "all", "strict success")[4:] == ["0.970 (0.970 to 0.970)", "0.980", "no"]
-    assert row(text, "Hih, ps", "Town 1", "all", "success")[4:] == ["-", "0.995", "-"]
+    assert row(text, "Hih, gs", "Town 1", "all", "strict success")[4:] == ["0.970 (0.970 to 0.970)", "0.980", "no", "2"]
+    assert row(text, "Hih, ps", "Town 1", "all", "success")[4:] == ["-", "0.995", "-", "0"]
     assert len(TARGETS) == text.count("\n|") - 2
 
 
