@@ -15,7 +15,7 @@ from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.expert import expert_action
 from ldrl.envs.camera import shift
-from ldrl.subtasks import LOW_LEVEL
+from ldrl.subtasks import LOW_LEVEL, SubTask
 from ldrl.towns import Town
 
 __all__ = ["MARGINS", "DemonstrationSampler", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
@@ -25,6 +25,9 @@ MARGINS = (10, 15)
 junction before it, nor so far into the one behind it, that the two look alike."""
 NEAR_END = 0.5
 """Share of slices that show the end of their snippet: lane following is long, and its end would be rare."""
+BEND, BENDS = 0.35, 0.5
+"""Turn of the heading over a slice that makes it a bend, rad, and the share of bends among lane following's other
+slices: bends are where a car leaves the road, and by chance one slice in ten would show one."""
 
 
 class Snippets(NamedTuple):
@@ -93,7 +96,8 @@ class SnippetSampler(DemonstrationSampler):
 
     The batch size of the buffer counts frames, as with :class:`torchrl.data.SliceSampler`. Each frame gets the
     snippet's ``subtask``, which its low-level policies are told, and ``end_of_subtask``, whether the snippet has ended:
-    true in the margin behind it. Half of the slices show their snippet's end.
+    true in the margin behind it. Half of the slices show their snippet's end; of the others of lane following, half lie
+    in a bend, if there is any.
 
     Args:
         buffer: demonstrations.
@@ -123,6 +127,19 @@ class SnippetSampler(DemonstrationSampler):
                     f"no {subtask.name.lower()} snippet of {slice_length} frames in {len(stored)} frames; collect more"
                 )
             self._groups.append((int(subtask), first[rows], last[rows], snippets.end[rows]))
+        self._bends = self._find_bends(torch.as_tensor(stored[keys.POSE])[:, 2])
+
+    def _find_bends(self, heading: Tensor) -> tuple[Tensor, Tensor]:
+        """The starts of all slices of lane following that lie in a bend, and where their snippets end."""
+        starts, ends = [], []
+        for subtask, *snippets in self._groups:
+            for first, last, end in zip(*snippets, strict=True) if subtask == SubTask.LANEFOLLOW else ():
+                start = torch.arange(int(first), int(last) + 1)
+                turned = heading[start + self.slice_length - 1] - heading[start]
+                bends = start[torch.atan2(turned.sin(), turned.cos()).abs() > BEND]
+                starts.append(bends)
+                ends.append(end.expand(len(bends)))
+        return torch.cat(starts), torch.cat(ends)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[Any, Tensor]]:
         """Draw slices.
@@ -147,10 +164,15 @@ class SnippetSampler(DemonstrationSampler):
             near_end = torch.rand(each, generator=self._generator) < NEAR_END
             low = torch.where(near_end, (end[rows] - self.slice_length + 1).clamp(first[rows], last[rows]), first[rows])
             part = torch.rand(each, generator=self._generator)
-            start = low + (part * (last[rows] - low + 1)).long()
+            start, behind = low + (part * (last[rows] - low + 1)).long(), end[rows]
+            if subtask == SubTask.LANEFOLLOW and len(self._bends[0]):
+                bend = torch.randint(len(self._bends[0]), (each,), generator=self._generator)
+                anew = ~near_end & (torch.rand(each, generator=self._generator) < BENDS)
+                start = start.where(~anew, self._bends[0][bend])
+                behind = behind.where(~anew, self._bends[1][bend])
             frames = start.unsqueeze(-1) + steps
             index.append(frames)
-            ended.append(frames >= end[rows].unsqueeze(-1))
+            ended.append(frames >= behind.unsqueeze(-1))
             told.append(torch.full_like(frames, subtask))
         info = {keys.SUBTASK: torch.cat(told).flatten(), keys.END_OF_SUBTASK: torch.cat(ended).flatten()}
         return torch.cat(index).flatten(), info
