@@ -10,7 +10,7 @@ from ldrl import keys
 from ldrl.collectors import DisturbedView, SnippetSampler, cut_snippets, expert_action
 from ldrl.envs import DashCamera
 from ldrl.envs.camera import shift
-from ldrl.subtasks import LOW_LEVEL
+from ldrl.subtasks import LOW_LEVEL, SubTask
 
 LENGTH, MARGIN, EACH = 15, 6, 40
 
@@ -69,6 +69,23 @@ def test_slices_are_balanced_and_show_ends(sampled):
         assert (told == subtask).sum() == EACH
         ends = info[keys.END_OF_SUBTASK][told == subtask].any(1).float().mean()
         assert 0.25 < ends < 0.95, subtask
+
+
+def test_lane_following_lies_in_bends_more_often_than_by_chance(demonstrations, monkeypatch):
+    heading = demonstrations.storage[:][keys.POSE][:, 2]
+
+    def bends():
+        sampler = SnippetSampler(demonstrations, 40)
+        index, info = sampler.sample(demonstrations.storage, 300 * 4 * 40)
+        slices = index.view(-1, 40)[info[keys.SUBTASK].view(-1, 40)[:, 0] == SubTask.LANEFOLLOW]
+        turned = heading[slices[:, -1]] - heading[slices[:, 0]]
+        return float((torch.atan2(turned.sin(), turned.cos()).abs() > 0.35).float().mean())
+
+    often = bends()
+    monkeypatch.setattr("ldrl.collectors.snippets.BEND", 9.0)  # none is found
+    by_chance = bends()
+    assert by_chance < 0.2
+    assert 0.2 < often - by_chance < 0.3
 
 
 def test_every_snippet_that_fits_is_drawn(demonstrations, labels):
