@@ -61,14 +61,17 @@ def test_clean_sentences_are_those_of_the_templates(passenger, monkeypatch):
 
 
 @pytest.mark.parametrize("name", KEYWORDS)
-def test_loose_phrasings_name_the_directions_of_their_keyword(passenger, monkeypatch, name):
+def test_loose_phrasings_name_the_directions_of_their_keyword(passenger, monkeypatch, spoken, name):
+    """But for a turn that is called the other way."""
     only(monkeypatch, CLEAN=1.0, LOOSE=1.0)
     monkeypatch.setattr("ldrl.language.passenger.OPTIONAL", 0.0)
     meant = {manoeuvre.name.lower() for manoeuvre in KEYWORDS[name].manoeuvres}
     sentences = said(passenger, name, 500)
     assert len(set(sentences)) > 80
+    opposite = {part.format(dir=KEYWORDS[name].manoeuvres[0].name.lower()) for part in spoken["slots"]["opposite"]}
     for sentence in sentences:
-        assert {word.removesuffix("s") for word in sentence.split()} >= meant - {"straight"}, sentence
+        if sentence not in opposite:
+            assert {word.removesuffix("s") for word in sentence.split()} >= meant - {"straight"}, sentence
 
 
 def test_parts_leave_their_directions_open(spoken):
@@ -83,6 +86,7 @@ def test_parts_leave_their_directions_open(spoken):
         "same",
         "first",
         "second",
+        "opposite",
     ]
     for part in (part for slot in of_a_turn for part in spoken["slots"][slot]):
         named = re.sub(r"\bright (after|behind|away|now|here)\b", "", part).split()
