@@ -232,6 +232,8 @@ def check(cfg: DictConfig) -> None:
     for name, given, least in (("jobs", [cfg.jobs], 1), ("seeds", cfg.seeds, 0)):
         if not all(type(value) is int and value >= least for value in given):
             raise ValueError(f"{name} is {cfg[name]}; give whole numbers of at least {least}")
+    if len(set(cfg.seeds)) < len(cfg.seeds):  # two cells would write to one folder
+        raise ValueError(f"seeds is {cfg.seeds}; give each seed once")
 
 
 @hydra.main(config_path="config", config_name="reproduce_paper", version_base="1.3")

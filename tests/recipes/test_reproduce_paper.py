@@ -167,6 +167,7 @@ def test_smoke_leaves_the_page_alone(reproduce):
         ("scale=huge", "scale has 'huge'; use some of default, smoke"),
         ("jobs=0", "jobs is 0; give whole numbers of at least 1"),
         ("seeds=[-1]", "seeds is [-1]; give whole numbers of at least 0"),
+        ("seeds=[0,0]", "seeds is [0, 0]; give each seed once"),
         ("seeds=1", "seeds is 1; give a list, such as seeds=[1]"),
         ("tables=input", "tables is 'input'; give a list, such as tables=[input]"),
     ],
