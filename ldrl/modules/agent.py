@@ -85,11 +85,12 @@ class Agent(TensorDictModuleBase):
             KeyError: an input or the memory is missing: the env lacks a transform, such as
                 :meth:`make_tensordict_primer`.
         """
-        missing = [key for key in self.in_keys if key not in tensordict.keys(True, True)]
+        in_keys = self.in_keys
+        missing = [key for key in in_keys if key not in tensordict.keys(True, True)]
         if missing:
             raise KeyError(
                 f"{missing[0]} is missing; give the env a DashCamera, an Instruction and agent.make_tensordict_primer()"
             )
         if tensordict.batch_dims == 0:
             return tensordict.update(self(tensordict.unsqueeze(0)).squeeze(0))
-        return tensordict.update(self._step(tensordict.select(*self.in_keys)))
+        return tensordict.update(self._step(tensordict.select(*in_keys)))
