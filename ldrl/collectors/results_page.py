@@ -48,8 +48,8 @@ The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_p
 - *success*, the paper's measure: no collision, and every point of the path within 10 m of the track. *strict success*:
   also never off the road, never in an oncoming lane, and `finish` declared within 15 m of the path's end. *paper*: what
   it reports as success, on routes of its own in CARLA; train is Town 1, test Town 2.
-- Trained in Town 1 and seven random towns. Episodes are all routes of our planner in Town 1 and Town 2, each driven once,
-  said in sentences without a phrase of the training's.
+- Trained in Town 1 and seven random towns. Episodes are all routes of our planner in Town 1 and Town 2, each driven
+  once, said in sentences without a phrase of the training's.
 - A figure is the mean over the seeds, in brackets the least and the largest of them. "-" is not measured yet, or not
   reported by the paper."""
 DEPARTURES = """\
@@ -59,8 +59,8 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
    CARLA's images are other ones than ours, and nobody has driven either agent in the other's.
 2. **Episodes** are all routes of our planner, not the paper's 159 and 142, so that `all` mixes the types in another
    proportion.
-3. **Training towns.** Town 1 and seven random towns, which have what Town 1 lacks: junctions of four streets. Town 2, as
-   in the paper, and the unseen towns are in no training.
+3. **Training towns.** Town 1 and seven random towns, which have what Town 1 lacks: junctions of four streets. Town 2,
+   as in the paper, and the unseen towns are in no training.
 4. **Sentences** come from our own templates on the paper's scale; evaluation says held-out ones only.
 5. **Sizes and schedule.** Networks of 0.9 million parameters with normalised convolutions, trained in minutes on two
    CPU cores.

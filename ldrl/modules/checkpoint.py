@@ -1,4 +1,7 @@
-"""Checkpoints: a folder with the weights (safetensors) and the config (JSON)."""
+"""Checkpoints: a folder with the weights (safetensors) and the config (JSON).
+
+A config may also name, from its folder, the checkpoint whose ``weights`` it drives with: the agent on ps is that on gs.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ __all__ = ["PRETRAINED", "load_agent", "resolve_checkpoint", "save_agent"]
 WEIGHTS = "agent.safetensors"
 CONFIG = "agent.json"
 SHIPPED = Path(__file__).parent / "weights"
-PRETRAINED = tuple(sorted(folder.name for folder in SHIPPED.glob("*") if (folder / WEIGHTS).is_file()))
+PRETRAINED = tuple(sorted(folder.name for folder in SHIPPED.glob("*") if (folder / CONFIG).is_file()))
 """Names of the checkpoints that ship with the package."""
 
 
@@ -50,7 +53,7 @@ def resolve_checkpoint(name: str | Path) -> Path:
         ValueError: there is neither; the message lists the names.
     """
     for folder in (Path(name), SHIPPED / name):
-        if (folder / WEIGHTS).is_file() and (folder / CONFIG).is_file():
+        if (folder / CONFIG).is_file():
             return folder
     known = ", ".join(PRETRAINED) or "none"
     raise ValueError(
@@ -69,29 +72,31 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Agent:
         ValueError: there is no such checkpoint, or its files are broken or another model's.
     """
     folder = resolve_checkpoint(name)
-    agent = _untrained(folder / CONFIG)
+    agent, file = _untrained(folder)
     try:
-        weights = load_file(folder / WEIGHTS)
+        weights = load_file(file)
     except (SafetensorError, OSError) as error:
-        raise ValueError(
-            f"{folder / WEIGHTS} is no complete safetensors file ({error}); copy or train it anew"
-        ) from None
+        raise ValueError(f"{file} is no complete safetensors file ({error}); copy or train it anew") from None
     expected = {key: tuple(value.shape) for key, value in agent.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in weights.items()}
     if expected != found:
         odd = sorted(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
         raise ValueError(
-            f"{folder / WEIGHTS} does not fit {CONFIG} beside it: {odd[0]} is {found.get(odd[0], 'missing')}, expected "
+            f"{file} does not fit {folder / CONFIG}: {odd[0]} is {found.get(odd[0], 'missing')}, expected "
             f"{expected.get(odd[0], 'absent')}; use the weights and the config of one training"
         )
     agent.load_state_dict(weights)
     return agent.eval().to(device)
 
 
-def _untrained(path: Path) -> Agent:
-    """The agent of a config file, with random weights."""
+def _untrained(folder: Path) -> tuple[Agent, Path]:
+    """The agent of a checkpoint's config, with random weights, and the file of its weights."""
     try:
-        return make_agent(AgentConfig(**json.loads(path.read_text(encoding="utf-8"))))
-    except (ValueError, TypeError, RuntimeError) as error:
+        settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        weights = folder / settings.pop("weights", ".") / WEIGHTS
+        return make_agent(AgentConfig(**settings)), weights
+    except (ValueError, TypeError, AttributeError, RuntimeError) as error:
         names = ", ".join(field.name for field in fields(AgentConfig))
-        raise ValueError(f"{path} is no agent config ({error}); it is a JSON object with {names}") from None
+        raise ValueError(
+            f"{folder / CONFIG} is no agent config ({error}); it is a JSON object with {names}"
+        ) from None

@@ -73,11 +73,27 @@ def test_unknown_names(name, tmp_path, monkeypatch):
         load_agent(name)
 
 
-@pytest.mark.parametrize("lacking", [WEIGHTS, CONFIG])
-def test_half_a_checkpoint_is_none(saved, lacking):
-    (saved / lacking).unlink()
+def test_half_a_checkpoint_is_none(saved):
+    (saved / WEIGHTS).rename(saved / "elsewhere")
+    with pytest.raises(ValueError, match=rf"{WEIGHTS} is no complete safetensors file .*; copy or train it anew"):
+        load_agent(saved)
+    (saved / "elsewhere").rename(saved / WEIGHTS)
+    (saved / CONFIG).unlink()
     with pytest.raises(ValueError, match="no checkpoint"):
         load_agent(saved)
+
+
+def test_drives_with_the_weights_of_another(saved, agent):
+    borrower = saved.parent / "borrower"
+    borrower.mkdir()
+    settings = json.loads((saved / CONFIG).read_text())
+    (borrower / CONFIG).write_text(json.dumps(settings | {"modality": "ps", "weights": f"../{saved.name}"}))
+    loaded = load_agent(borrower)
+    assert loaded.modality == "ps"
+    assert all(torch.equal(value, agent.state_dict()[name]) for name, value in loaded.state_dict().items())
+    (saved / WEIGHTS).unlink()
+    with pytest.raises(ValueError, match=rf"{saved.name}/{WEIGHTS} is no complete safetensors file"):
+        load_agent(borrower)
 
 
 @pytest.mark.parametrize("keep", [0, 5, 100, -1])
@@ -93,7 +109,7 @@ def test_weights_of_something_else(saved):
     with pytest.raises(ValueError, match="no complete safetensors file"):
         load_agent(saved)
     save_file({"linear.weight": torch.zeros(2, 2)}, saved / WEIGHTS)
-    with pytest.raises(ValueError, match=rf"{WEIGHTS} does not fit {CONFIG} beside it: .* use the weights and the con"):
+    with pytest.raises(ValueError, match=rf"{WEIGHTS} does not fit .*{CONFIG}: .* use the weights and the con"):
         load_agent(saved)
 
 

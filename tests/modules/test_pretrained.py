@@ -22,7 +22,7 @@ def test_ship_with_their_reports_and_are_small():
     sizes = sum(file.stat().st_size for file in SHIPPED.rglob("*"))  # the segmenter of ps
     for name in PRETRAINED:
         files = {file.name: file.stat().st_size for file in resolve_checkpoint(name).iterdir()}
-        assert {"agent.safetensors", "agent.json", "report.md"} <= set(files)
+        assert {"agent.json", "report.md"} <= set(files)
         sizes += sum(files.values())
     assert sizes <= 12 * 2**20
 
