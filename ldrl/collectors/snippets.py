@@ -15,6 +15,7 @@ from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.expert import expert_action
 from ldrl.envs.camera import shift
+from ldrl.modules.controller import VOTES_NEEDED
 from ldrl.subtasks import LOW_LEVEL, SubTask
 from ldrl.towns import Town
 
@@ -95,9 +96,9 @@ class SnippetSampler(DemonstrationSampler):
     """Draws slices of fixed length within snippets and their margins, as many of each sub-task.
 
     The batch size of the buffer counts frames, as with :class:`torchrl.data.SliceSampler`. Each frame gets the
-    snippet's ``subtask``, which its low-level policies are told, and ``end_of_subtask``, whether the snippet has ended:
-    true in the margin behind it. Half of the slices show their snippet's end; of the others of lane following, half lie
-    in a bend, if there is any.
+    snippet's ``subtask``, which its low-level policies are told, and ``end_of_subtask``, whether to vote for its end: true
+    in the margin behind it, and in the frames before that the controller takes to count the votes. Half of the slices
+    show their snippet's end; of the others of lane following, half lie in a bend, if there is any.
 
     Args:
         buffer: demonstrations.
@@ -172,7 +173,7 @@ class SnippetSampler(DemonstrationSampler):
                 behind = behind.where(~anew, self._bends[1][bend])
             frames = start.unsqueeze(-1) + steps
             index.append(frames)
-            ended.append(frames >= behind.unsqueeze(-1))
+            ended.append(frames >= behind.unsqueeze(-1) - VOTES_NEEDED)
             told.append(torch.full_like(frames, subtask))
         info = {keys.SUBTASK: torch.cat(told).flatten(), keys.END_OF_SUBTASK: torch.cat(ended).flatten()}
         return torch.cat(index).flatten(), info

@@ -45,8 +45,8 @@ OPTIONAL = 0.2
 """Probability that a loose phrasing has a part that it may leave out."""
 CLEAN = 0.2
 """Share of commands that are said without anything around them."""
-SHORTENED = 0.2
-"""Share of the other commands of which only the words that decide are sure to be left."""
+SHORTENED = 0.3
+"""Share of the other commands of which only what decides is sure to be left."""
 CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.35, 0.15, 0.25, 0.4
 """Shares of them with a self-correction, fillers, talk around them, a repetition, slips of the tongue, the typing hand
 or the speech recogniser, and words dropped, replaced or inserted at random."""
@@ -131,15 +131,16 @@ class Passenger:
         return " ".join(parts)
 
     def _shorten(self, keyword: Keyword, words: list[str], rng: random.Random) -> list[str]:
-        """Leave out what the meaning does not need, if the keyword's own words say it, in its order."""
+        """Leave out what the meaning does not need: if the keyword's own words say it, in its order, nearly all."""
         own = keyword.name.replace(",", " ").split()
         meant, said = ([word for word in text if word in DIRECTIONS] for text in (own, words))
         counted = keyword.type != "ordinal" or all((word in words) == (word in own) for word in ORDINALS)
-        if said != meant or not counted or not set(words).isdisjoint(NEGATIONS):
-            return words
         rate = rng.uniform(0.3, 1)
-        # "Left and after that right" must not come to "left after right".
-        return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
+        if said == meant and counted and set(words).isdisjoint(NEGATIONS):
+            # "Left and after that right" must not come to "left after right".
+            return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
+        spare = _spoken()["spare"]
+        return [word for word in words if word not in spare or rng.random() >= rate]
 
     def _disturb(self, words: list[str], rng: random.Random) -> list[str]:
         """Drop, replace and insert words that do not say which way or how often."""
@@ -148,7 +149,7 @@ class Passenger:
             if rng.random() < RATE:
                 disturbed.append(rng.choice(self._words))
             chance = rng.random()
-            if word in MEANINGFUL or chance >= 2 * RATE:
+            if word in MEANINGFUL or word in TURNING_ROUND or word in NEGATIONS or chance >= 2 * RATE:
                 disturbed.append(word)
             elif chance < RATE:
                 disturbed.append(rng.choice(self._words))
