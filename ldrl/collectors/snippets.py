@@ -96,9 +96,9 @@ class SnippetSampler(DemonstrationSampler):
     """Draws slices of fixed length within snippets and their margins, as many of each sub-task.
 
     The batch size of the buffer counts frames, as with :class:`torchrl.data.SliceSampler`. Each frame gets the
-    snippet's ``subtask``, which its low-level policies are told, and ``end_of_subtask``, whether to vote for its end: true
-    in the margin behind it, and in the frames before that the controller takes to count the votes. Half of the slices
-    show their snippet's end; of the others of lane following, half lie in a bend, if there is any.
+    snippet's ``subtask``, which its low-level policies are told, and ``end_of_subtask``, whether to vote for its end:
+    true in the margin behind it, and in the frames before that the controller takes to count the votes. Half of the
+    slices show their snippet's end; of the others of lane following, half lie in a bend, if there is any.
 
     Args:
         buffer: demonstrations.

@@ -136,11 +136,11 @@ class Passenger:
         meant, said = ([word for word in text if word in DIRECTIONS] for text in (own, words))
         counted = keyword.type != "ordinal" or all((word in words) == (word in own) for word in ORDINALS)
         rate = rng.uniform(0.3, 1)
-        if said == meant and counted and set(words).isdisjoint(NEGATIONS):
-            # "Left and after that right" must not come to "left after right".
-            return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
-        spare = _spoken()["spare"]
-        return [word for word in words if word not in spare or rng.random() >= rate]
+        if said != meant or not counted or not set(words).isdisjoint(NEGATIONS):
+            spare = _spoken()["spare"]
+            return [word for word in words if word not in spare or rng.random() >= rate]
+        # "Left and after that right" must not come to "left after right".
+        return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
 
     def _disturb(self, words: list[str], rng: random.Random) -> list[str]:
         """Drop, replace and insert words that do not say which way or how often."""
