@@ -97,6 +97,4 @@ def _untrained(folder: Path) -> tuple[Agent, Path]:
         return make_agent(AgentConfig(**settings)), weights
     except (ValueError, TypeError, AttributeError, RuntimeError) as error:
         names = ", ".join(field.name for field in fields(AgentConfig))
-        raise ValueError(
-            f"{folder / CONFIG} is no agent config ({error}); it is a JSON object with {names}"
-        ) from None
+        raise ValueError(f"{folder / CONFIG} is no agent config ({error}); it is a JSON object with {names}") from None
