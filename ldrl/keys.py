@@ -60,7 +60,8 @@ KEYWORD = "keyword"
 SUBTASK = "subtask"
 """Label: the sub-task that the route asks for here, ``[*B]`` int64."""
 END_OF_SUBTASK = "end_of_subtask"
-"""Label: whether the sub-task of the step before has ended, ``[*B]`` bool."""
+"""Label, ``[*B]`` bool: whether the sub-task of the step before has ended; in slices for training, whether to vote for
+the end of the one that the slice is told."""
 
 WORLD = "world"
 POSE = (WORLD, "pose")

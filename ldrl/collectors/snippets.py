@@ -118,6 +118,8 @@ class SnippetSampler(DemonstrationSampler):
         first = (snippets.start - margins[0]).maximum(snippets.drive_start)
         last = (snippets.end + margins[1]).minimum(snippets.drive_end) - slice_length
         fits = last >= first
+        # The first frame to vote in; a snippet that is cut off with its drive has none.
+        vote = torch.where(snippets.end < snippets.drive_end, snippets.end - VOTES_NEEDED, snippets.drive_end)
         self.slice_length = slice_length
         self._generator = torch.Generator().manual_seed(seed)
         self._groups = []
@@ -127,20 +129,20 @@ class SnippetSampler(DemonstrationSampler):
                 raise ValueError(
                     f"no {subtask.name.lower()} snippet of {slice_length} frames in {len(stored)} frames; collect more"
                 )
-            self._groups.append((int(subtask), first[rows], last[rows], snippets.end[rows]))
+            self._groups.append((int(subtask), first[rows], last[rows], snippets.end[rows], vote[rows]))
         self._bends = self._find_bends(torch.as_tensor(stored[keys.POSE])[:, 2])
 
     def _find_bends(self, heading: Tensor) -> tuple[Tensor, Tensor]:
-        """The starts of all slices of lane following that lie in a bend, and where their snippets end."""
-        starts, ends = [], []
+        """The starts of all slices of lane following that lie in a bend, and from when on to vote for their end."""
+        starts, votes = [], []
         for subtask, *snippets in self._groups:
-            for first, last, end in zip(*snippets, strict=True) if subtask == SubTask.LANEFOLLOW else ():
+            for first, last, _, vote in zip(*snippets, strict=True) if subtask == SubTask.LANEFOLLOW else ():
                 start = torch.arange(int(first), int(last) + 1)
                 turned = heading[start + self.slice_length - 1] - heading[start]
                 bends = start[torch.atan2(turned.sin(), turned.cos()).abs() > BEND]
                 starts.append(bends)
-                ends.append(end.expand(len(bends)))
-        return torch.cat(starts), torch.cat(ends)
+                votes.append(vote.expand(len(bends)))
+        return torch.cat(starts), torch.cat(votes)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[Any, Tensor]]:
         """Draw slices.
@@ -160,20 +162,20 @@ class SnippetSampler(DemonstrationSampler):
             )
         steps = torch.arange(self.slice_length)
         index, ended, told = [], [], []
-        for subtask, first, last, end in self._groups:
+        for subtask, first, last, end, vote in self._groups:
             rows = torch.randint(len(first), (each,), generator=self._generator)
             near_end = torch.rand(each, generator=self._generator) < NEAR_END
             low = torch.where(near_end, (end[rows] - self.slice_length + 1).clamp(first[rows], last[rows]), first[rows])
             part = torch.rand(each, generator=self._generator)
-            start, behind = low + (part * (last[rows] - low + 1)).long(), end[rows]
+            start, voting = low + (part * (last[rows] - low + 1)).long(), vote[rows]
             if subtask == SubTask.LANEFOLLOW and len(self._bends[0]):
                 bend = torch.randint(len(self._bends[0]), (each,), generator=self._generator)
                 anew = ~near_end & (torch.rand(each, generator=self._generator) < BENDS)
                 start = start.where(~anew, self._bends[0][bend])
-                behind = behind.where(~anew, self._bends[1][bend])
+                voting = voting.where(~anew, self._bends[1][bend])
             frames = start.unsqueeze(-1) + steps
             index.append(frames)
-            ended.append(frames >= behind.unsqueeze(-1) - VOTES_NEEDED)
+            ended.append(frames >= voting.unsqueeze(-1))
             told.append(torch.full_like(frames, subtask))
         info = {keys.SUBTASK: torch.cat(told).flatten(), keys.END_OF_SUBTASK: torch.cat(ended).flatten()}
         return torch.cat(index).flatten(), info

@@ -36,7 +36,7 @@ MEANINGFUL = frozenset(
         "couple",
     ]
 )
-"""Words that say which way and how often: never dropped, replaced or stammered, but they may be misspelt."""
+"""Words that say which way and how often: never left out or stammered, but they may be misspelt."""
 FREQUENT = 20_000
 """How many of the most frequent words can be put into a sentence at random."""
 LOOSE = 0.6
@@ -57,6 +57,10 @@ RATE = 0.1
 DENIALS = ("not", "and not", "but not", "don t", "never", "rather than", "instead of")
 TURNING_ROUND = ("after", "before", "once")
 NEGATIONS = ("no", "not", "don", "never")
+DECISIVE = MEANINGFUL.union(
+    TURNING_ROUND, NEGATIONS, ("skip", "pass", "past", "without", "neither", "opposite", "other")
+)
+"""Words that are not dropped, replaced or inserted at random: they would make another command of one."""
 DIRECTIONS = ("left", "right", "straight")
 ORDINALS = ("first", "second")
 
@@ -80,7 +84,7 @@ class Passenger:
         self._sentences = Sentences("train")
         # GloVe's rows are sorted by frequency: what people say is among the first.
         frequent = list((load_glove() if glove is None else glove).words)[:FREQUENT]
-        self._words = [word for word in frequent if word.isalpha() and word not in MEANINGFUL]
+        self._words = [word for word in frequent if word.isalpha() and word not in DECISIVE]
 
     def say(self, keyword: str | Keyword, rng: random.Random) -> str:
         """Say a keyword.
@@ -131,13 +135,17 @@ class Passenger:
         return " ".join(parts)
 
     def _shorten(self, keyword: Keyword, words: list[str], rng: random.Random) -> list[str]:
-        """Leave out what the meaning does not need: if the keyword's own words say it, in its order, nearly all."""
+        """Leave out what the meaning does not need.
+
+        If the keyword's own words say it, in its order, these are enough. Else only ``spare`` words can go, and only if
+        there is a direction for the others to speak of.
+        """
         own = keyword.name.replace(",", " ").split()
         meant, said = ([word for word in text if word in DIRECTIONS] for text in (own, words))
         counted = keyword.type != "ordinal" or all((word in words) == (word in own) for word in ORDINALS)
         rate = rng.uniform(0.3, 1)
         if said != meant or not counted or not set(words).isdisjoint(NEGATIONS):
-            spare = _spoken()["spare"]
+            spare = _spoken()["spare"] if said else ()
             return [word for word in words if word not in spare or rng.random() >= rate]
         # "Left and after that right" must not come to "left after right".
         return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
@@ -149,7 +157,7 @@ class Passenger:
             if rng.random() < RATE:
                 disturbed.append(rng.choice(self._words))
             chance = rng.random()
-            if word in MEANINGFUL or word in TURNING_ROUND or word in NEGATIONS or chance >= 2 * RATE:
+            if word in DECISIVE or chance >= 2 * RATE:
                 disturbed.append(word)
             elif chance < RATE:
                 disturbed.append(rng.choice(self._words))
