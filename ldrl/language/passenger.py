@@ -46,7 +46,7 @@ OPTIONAL = 0.2
 CLEAN = 0.2
 """Share of commands that are said without anything around them."""
 SHORTENED = 0.3
-"""Share of the other commands of which only what decides is sure to be left."""
+"""Share of the other commands that leave out what their meaning does not need."""
 CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.35, 0.15, 0.25, 0.4
 """Shares of them with a self-correction, fillers, talk around them, a repetition, slips of the tongue, the typing hand
 or the speech recogniser, and words dropped, replaced or inserted at random."""

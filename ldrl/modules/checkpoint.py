@@ -1,6 +1,7 @@
 """Checkpoints: a folder with the weights (safetensors) and the config (JSON).
 
-A config may also name, from its folder, the checkpoint whose ``weights`` it drives with: the agent on ps is that on gs.
+A config may instead name, from its folder, another checkpoint as its ``weights`` and only what differs from its config:
+the agent on ps is that on gs.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import json
 import os
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -53,7 +55,7 @@ def resolve_checkpoint(name: str | Path) -> Path:
         ValueError: there is neither; the message lists the names.
     """
     for folder in (Path(name), SHIPPED / name):
-        if (folder / CONFIG).is_file():
+        if (folder / CONFIG).is_file() and (_lender(folder) / WEIGHTS).is_file():
             return folder
     known = ", ".join(PRETRAINED) or "none"
     raise ValueError(
@@ -72,7 +74,7 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Agent:
         ValueError: there is no such checkpoint, or its files are broken or another model's.
     """
     folder = resolve_checkpoint(name)
-    agent, file = _untrained(folder)
+    agent, file = _untrained(folder), _lender(folder) / WEIGHTS
     try:
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
@@ -89,12 +91,22 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Agent:
     return agent.eval().to(device)
 
 
-def _untrained(folder: Path) -> tuple[Agent, Path]:
-    """The agent of a checkpoint's config, with random weights, and the file of its weights."""
+def _lender(folder: Path) -> Path:
+    """The folder that has a checkpoint's weights: its own, or the one that its config names."""
     try:
-        settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-        weights = folder / settings.pop("weights", ".") / WEIGHTS
-        return make_agent(AgentConfig(**settings)), weights
-    except (ValueError, TypeError, AttributeError, RuntimeError) as error:
+        return folder / json.loads((folder / CONFIG).read_text(encoding="utf-8")).get("weights", "")
+    except (ValueError, TypeError, AttributeError):  # no agent config, which is told when it is read
+        return folder
+
+
+def _untrained(folder: Path) -> Agent:
+    """The agent of a checkpoint's config, with random weights."""
+    try:
+        settings: dict[str, Any] = {}
+        for config in (_lender(folder) / CONFIG, folder / CONFIG):
+            settings |= json.loads(config.read_text(encoding="utf-8"))
+        settings.pop("weights", None)
+        return make_agent(AgentConfig(**settings))
+    except (ValueError, TypeError, OSError, RuntimeError) as error:
         names = ", ".join(field.name for field in fields(AgentConfig))
         raise ValueError(f"{folder / CONFIG} is no agent config ({error}); it is a JSON object with {names}") from None

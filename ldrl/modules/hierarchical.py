@@ -42,7 +42,7 @@ class HierarchicalAgent(Agent):
         super().__init__(AgentConfig() if config is None else config)
         if not self.config.parts.hierarchical:
             raise ValueError(f"model is {self.config.model!r}, which has no hierarchy; use make_agent")
-        # In this order the reader's size changes nothing in the low level that a seed gives.
+        # Made first, so that a seed gives the same low level whatever the reader's size.
         self.control = self._low_level("control", keys.ACTION, 2)
         self.end_of_subtask = self._low_level("end", keys.END_LOGIT, 1)
         self.high_level = HighLevelPolicy(self.config)

@@ -73,12 +73,9 @@ def test_unknown_names(name, tmp_path, monkeypatch):
         load_agent(name)
 
 
-def test_half_a_checkpoint_is_none(saved):
-    (saved / WEIGHTS).rename(saved / "elsewhere")
-    with pytest.raises(ValueError, match=rf"{WEIGHTS} is no complete safetensors file .*; copy or train it anew"):
-        load_agent(saved)
-    (saved / "elsewhere").rename(saved / WEIGHTS)
-    (saved / CONFIG).unlink()
+@pytest.mark.parametrize("lacking", [WEIGHTS, CONFIG])
+def test_half_a_checkpoint_is_none(saved, lacking):
+    (saved / lacking).unlink()
     with pytest.raises(ValueError, match="no checkpoint"):
         load_agent(saved)
 
@@ -86,13 +83,12 @@ def test_half_a_checkpoint_is_none(saved):
 def test_drives_with_the_weights_of_another(saved, agent):
     borrower = saved.parent / "borrower"
     borrower.mkdir()
-    settings = json.loads((saved / CONFIG).read_text())
-    (borrower / CONFIG).write_text(json.dumps(settings | {"modality": "ps", "weights": f"../{saved.name}"}))
+    (borrower / CONFIG).write_text(json.dumps({"modality": "ps", "weights": f"../{saved.name}"}))
     loaded = load_agent(borrower)
-    assert loaded.modality == "ps"
+    assert vars(loaded.config) == vars(agent.config) | {"modality": "ps"}
     assert all(torch.equal(value, agent.state_dict()[name]) for name, value in loaded.state_dict().items())
     (saved / WEIGHTS).unlink()
-    with pytest.raises(ValueError, match=rf"{saved.name}/{WEIGHTS} is no complete safetensors file"):
+    with pytest.raises(ValueError, match="no checkpoint"):
         load_agent(borrower)
 
 
