@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -16,14 +17,15 @@ from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.expert import expert_action
 from ldrl.envs.camera import shift
 from ldrl.modules.controller import VOTES_NEEDED
-from ldrl.subtasks import LOW_LEVEL, SubTask
+from ldrl.subtasks import LOW_LEVEL, MANOEUVRES, SubTask
 from ldrl.towns import Town
 
 __all__ = ["MARGINS", "DemonstrationSampler", "DisturbedView", "SnippetSampler", "Snippets", "cut_snippets"]
 
-MARGINS = (10, 15)
-"""Frames before and behind a snippet that its slices may reach into. Lane following must not reach so far back into the
-junction before it, nor so far into the one behind it, that the two look alike."""
+MARGINS = dict.fromkeys(MANOEUVRES, (5, 25)) | {SubTask.LANEFOLLOW: (10, 15)}
+"""Frames before and behind a snippet that its slices may reach into. Some slices of a manoeuvre begin inside it, as
+where a car sets out at the mouth of a junction. Lane following must not reach so far back into the junction before it,
+nor so far into the one behind it, that the two look alike."""
 NEAR_END = 0.5
 """Share of slices that show the end of their snippet: lane following is long, and its end would be rare."""
 BEND, BENDS = 0.35, 0.5
@@ -103,7 +105,7 @@ class SnippetSampler(DemonstrationSampler):
     Args:
         buffer: demonstrations.
         slice_length: frames in a slice.
-        margins: frames before and behind a snippet.
+        margins: frames before and behind a snippet, for each sub-task.
         seed: of the sampler's own generator.
 
     Raises:
@@ -111,12 +113,17 @@ class SnippetSampler(DemonstrationSampler):
     """
 
     def __init__(
-        self, buffer: TensorDictReplayBuffer, slice_length: int = 40, margins: tuple[int, int] = MARGINS, seed: int = 0
+        self,
+        buffer: TensorDictReplayBuffer,
+        slice_length: int = 40,
+        margins: Mapping[SubTask, tuple[int, int]] = MARGINS,
+        seed: int = 0,
     ) -> None:
         stored = buffer.storage[:]
         snippets = cut_snippets(torch.as_tensor(stored[keys.SUBTASK]), torch.as_tensor(stored[TRAJECTORY]))
-        first = (snippets.start - margins[0]).maximum(snippets.drive_start)
-        last = (snippets.end + margins[1]).minimum(snippets.drive_end) - slice_length
+        before, behind = torch.tensor([margins[subtask] for subtask in LOW_LEVEL])[snippets.subtask].unbind(-1)
+        first = (snippets.start - before).maximum(snippets.drive_start)
+        last = (snippets.end + behind).minimum(snippets.drive_end) - slice_length
         fits = last >= first
         # The first frame to vote in; a snippet that is cut off with its drive has none.
         vote = torch.where(snippets.end < snippets.drive_end, snippets.end - VOTES_NEEDED, snippets.drive_end)

@@ -10,14 +10,15 @@ from ldrl import keys
 from ldrl.collectors import DisturbedView, SnippetSampler, cut_snippets, expert_action
 from ldrl.envs import DashCamera
 from ldrl.envs.camera import shift
-from ldrl.subtasks import LOW_LEVEL, SubTask
+from ldrl.subtasks import LOW_LEVEL, MANOEUVRES, SubTask
 
 LENGTH, MARGIN, EACH = 15, 6, 40
+MARGINS = dict.fromkeys(LOW_LEVEL, (MARGIN, MARGIN))
 
 
 @pytest.fixture
 def sampled(demonstrations):
-    sampler = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN))
+    sampler = SnippetSampler(demonstrations, LENGTH, MARGINS)
     index, info = sampler.sample(demonstrations.storage, EACH * 4 * LENGTH)
     return index.view(-1, LENGTH), {key: value.view(-1, LENGTH) for key, value in info.items()}
 
@@ -95,12 +96,32 @@ def test_lane_following_lies_in_bends_more_often_than_by_chance(demonstrations, 
     assert 0.2 < often - by_chance < 0.3
 
 
+def test_each_subtask_has_margins_of_its_own(demonstrations, labels):
+    subtask = labels[0]
+    margins = {SubTask.LEFT: (2, 9), SubTask.RIGHT: (0, 5), SubTask.STRAIGHT: (4, 0), SubTask.LANEFOLLOW: (7, 3)}
+    index, info = SnippetSampler(demonstrations, LENGTH, margins).sample(demonstrations.storage, 300 * 4 * LENGTH)
+    index, told = index.view(-1, LENGTH), info[keys.SUBTASK].view(-1, LENGTH)
+    inside = subtask[index] == told
+    before = (~inside & ~inside.cumsum(1).bool()).sum(1)
+    behind = (~inside & inside.cumsum(1).bool()).sum(1)
+    for which, reach in margins.items():
+        drawn = told[:, 0] == which
+        assert (before[drawn].max(), behind[drawn].max()) == reach, which
+
+
+def test_some_slices_of_a_manoeuvre_begin_inside_it(demonstrations, labels):
+    subtask = labels[0]
+    index, info = SnippetSampler(demonstrations).sample(demonstrations.storage, 300 * 4 * 40)
+    starts, told = index.view(-1, 40)[:, 0], info[keys.SUBTASK].view(-1, 40)[:, 0]
+    for which in MANOEUVRES:
+        begun = subtask[(starts[told == which] - 4).clamp(min=0)] == which
+        assert 0.1 < begun.float().mean() < 0.9, which
+
+
 def test_every_snippet_that_fits_is_drawn(demonstrations, labels):
     subtask, drive, _ = labels
     snippets = cut_snippets(subtask, drive)
-    index, info = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)).sample(
-        demonstrations.storage, 600 * 4 * LENGTH
-    )
+    index, info = SnippetSampler(demonstrations, LENGTH, MARGINS).sample(demonstrations.storage, 600 * 4 * LENGTH)
     left = index.view(-1, LENGTH)[info[keys.SUBTASK].view(-1, LENGTH)[:, 0] == 0]
     lengths = (snippets.end + MARGIN).minimum(snippets.drive_end) - (snippets.start - MARGIN).maximum(
         snippets.drive_start
@@ -114,7 +135,7 @@ def test_a_buffer_writes_what_the_sampler_says(demonstrations):
     def sample(seed):
         return TensorDictReplayBuffer(
             storage=demonstrations.storage,
-            sampler=SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN), seed=seed),
+            sampler=SnippetSampler(demonstrations, LENGTH, MARGINS, seed=seed),
             batch_size=4 * LENGTH,
         ).sample()
 
@@ -122,7 +143,7 @@ def test_a_buffer_writes_what_the_sampler_says(demonstrations):
     assert first.shape == (4 * LENGTH,)
     assert torch.equal(first[keys.POSE], again[keys.POSE])
     assert not torch.equal(first[keys.POSE], other[keys.POSE])
-    index, info = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)).sample(demonstrations.storage, 4 * LENGTH)
+    index, info = SnippetSampler(demonstrations, LENGTH, MARGINS).sample(demonstrations.storage, 4 * LENGTH)
     assert torch.equal(first[keys.POSE], demonstrations.storage[:][keys.POSE][index])
     for key, value in info.items():
         assert torch.equal(first[key], value)
@@ -130,21 +151,21 @@ def test_a_buffer_writes_what_the_sampler_says(demonstrations):
 
 @pytest.mark.usefixtures("global_rng")
 def test_state_goes_on_where_it_was(demonstrations, tmp_path):
-    sampler = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN))
+    sampler = SnippetSampler(demonstrations, LENGTH, MARGINS)
     sampler.sample(demonstrations.storage, 4 * LENGTH)
     sampler.dumps(tmp_path / "state")
     expected, _ = sampler.sample(demonstrations.storage, 4 * LENGTH)
-    fresh = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN), seed=5)
+    fresh = SnippetSampler(demonstrations, LENGTH, MARGINS, seed=5)
     fresh.loads(tmp_path / "state")
     assert torch.equal(fresh.sample(demonstrations.storage, 4 * LENGTH)[0], expected)
 
 
 def test_errors_say_what_to_do(demonstrations, few):
-    sampler = SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN))
+    sampler = SnippetSampler(demonstrations, LENGTH, MARGINS)
     with pytest.raises(ValueError, match=rf"batch of 100 frames .* slices of {LENGTH} .*multiple of {4 * LENGTH}"):
         sampler.sample(demonstrations.storage, 100)
     with pytest.raises(ValueError, match=rf"no \w+ snippet of {LENGTH} frames in 60 frames; collect more"):
-        SnippetSampler(few, LENGTH, (MARGIN, MARGIN))
+        SnippetSampler(few, LENGTH, MARGINS)
 
 
 @pytest.fixture
@@ -199,7 +220,7 @@ def test_views_are_seeded_and_leave_the_storage_alone(town2, demonstrations):
     def sample(seed):
         return TensorDictReplayBuffer(
             storage=demonstrations.storage,
-            sampler=SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)),
+            sampler=SnippetSampler(demonstrations, LENGTH, MARGINS),
             batch_size=4 * LENGTH,
             transform=DisturbedView(town2, LENGTH, seed=seed),
         ).sample()
@@ -213,7 +234,7 @@ def test_views_are_seeded_and_leave_the_storage_alone(town2, demonstrations):
 def test_the_camera_behind_it_draws_the_moved_view(town2, demonstrations):
     buffer = TensorDictReplayBuffer(
         storage=demonstrations.storage,
-        sampler=SnippetSampler(demonstrations, LENGTH, (MARGIN, MARGIN)),
+        sampler=SnippetSampler(demonstrations, LENGTH, MARGINS),
         batch_size=4 * LENGTH,
         transform=DisturbedView(town2, LENGTH, lateral=0.8, yaw=math.radians(14)),
     )
