@@ -13,7 +13,6 @@ from torchrl.envs import Compose, Transform
 
 from ldrl import keys
 from ldrl.collectors.segments import BoundarySampler
-from ldrl.language import KEYWORDS
 from ldrl.towns import Town
 
 __all__ = ["DriveSampler", "OncePerFrame"]
@@ -56,8 +55,7 @@ class DriveSampler(BoundarySampler):
             raise ValueError(f"a batch of {batch_size} frames does not divide into drives of {self.length} frames")
         first, last, sentences = [], [], []
         for _ in range(batch_size // self.length):
-            keyword = self._random.choice(list(KEYWORDS.values()))
-            segment = self._random.choice(self._segments[keyword.name])
+            keyword, segment = self._possible()
             behind = segment.snippets[-1]
             first.append(self._decisions(segment)[0][0])
             last.append(min(int(self._snippets.start[behind]) + BEHIND, int(self._snippets.drive_end[behind])) - 1)

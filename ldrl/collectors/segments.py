@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import random
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,17 +115,24 @@ def find_misleading(
     allowed = find_segments(town, snippets, lane, max_junctions)
     found: dict[str, list[list[Segment]]] = {}
     for name, segments in find_segments(town, snippets, lane, max_junctions, SAFE_KEYWORDS).items():
-        groups: dict[tuple[SubTask, ...], list[Segment]] = {}
         possible = set(allowed[name])
-        for segment in segments:
-            if segment not in possible:
-                groups.setdefault(segment.manoeuvres, []).append(segment)
-        found[name] = list(groups.values())
+        found[name] = _by_answer(segment for segment in segments if segment not in possible)
     return found
+
+
+def _by_answer(segments: Iterable[Segment]) -> list[list[Segment]]:
+    """Group segments by what is done at their junctions."""
+    groups: dict[tuple[SubTask, ...], list[Segment]] = {}
+    for segment in segments:
+        groups.setdefault(segment.manoeuvres, []).append(segment)
+    return list(groups.values())
 
 
 class BoundarySampler(DemonstrationSampler):
     """Draws sequences of high-level decisions at the boundaries between sub-tasks, as many of each keyword.
+
+    A keyword is answered in more than one way where it may pass junctions first; one way is drawn with the square root
+    of how often it is driven, since hardly one car in fifty meets a street on the left only at the third junction.
 
     The first decision is where the instruction is given; each later one falls around the end of the sub-task before;
     the last one is ``FINISH``. The batch size of the buffer counts decisions, padding included. Each gets the
@@ -157,10 +165,11 @@ class BoundarySampler(DemonstrationSampler):
         self._subtask = torch.as_tensor(stored[keys.SUBTASK])
         self._snippets = cut_snippets(self._subtask, torch.as_tensor(stored[TRAJECTORY]))
         lane = stored[keys.ROUTE][:, 1].long()
-        self._segments = find_segments(town, self._snippets, lane, max_junctions)
-        lacking = [name for name, segments in self._segments.items() if not segments]
+        found = find_segments(town, self._snippets, lane, max_junctions)
+        lacking = [name for name, segments in found.items() if not segments]
         if lacking:
             raise ValueError(f"no drive in {len(stored)} frames realises {', '.join(lacking)}; collect more")
+        self._segments = {name: _by_answer(segments) for name, segments in found.items()}
         self._misleading = find_misleading(town, self._snippets, lane, max_junctions) if misleading else {}
         lacking = [name for name, groups in self._misleading.items() if not groups]
         if lacking:
@@ -213,8 +222,14 @@ class BoundarySampler(DemonstrationSampler):
         if self._misleading and self._random.random() < self.misleading:
             keyword = self._random.choice(list(SAFE_KEYWORDS.values()))
             return keyword, self._random.choice(self._random.choice(self._misleading[keyword.name]))
+        return self._possible()
+
+    def _possible(self) -> tuple[Keyword, Segment]:
+        """A keyword and a drive that does what it asks for."""
         keyword = self._random.choice(list(KEYWORDS.values()))
-        return keyword, self._random.choice(self._segments[keyword.name])
+        groups = self._segments[keyword.name]
+        (group,) = self._random.choices(groups, [math.sqrt(len(group)) for group in groups])
+        return keyword, self._random.choice(group)
 
     def _decisions(self, segment: Segment) -> list[tuple[int, SubTask]]:
         """Frames and right answers of one drive through a segment."""

@@ -211,7 +211,11 @@ def test_without_misleading_instructions_the_draws_stay_what_they_were(demonstra
     sampler = BoundarySampler(demonstrations, town2, seed=7)
     index, _ = sampler.sample(demonstrations.storage, 20 * sampler.decisions)
     for frames in index.view(20, -1).tolist():
-        segment = rng.choice(found[rng.choice(list(KEYWORDS.values())).name]).snippets
+        answers = {}
+        for each in found[rng.choice(list(KEYWORDS.values())).name]:
+            answers.setdefault(each.manoeuvres, []).append(each)
+        ways = list(answers.values())
+        segment = rng.choice(rng.choices(ways, [len(way) ** 0.5 for way in ways])[0]).snippets
         boundary = int(snippets.start[segment[1]])
         earliest = snippets.start[segment[0]] if rng.random() < 0.25 else max(snippets.start[segment[0]], boundary - 70)
         frame = rng.randint(int(earliest), boundary + 16)
@@ -220,6 +224,29 @@ def test_without_misleading_instructions_the_draws_stay_what_they_were(demonstra
             rng.randint(-4, 8)
         rng.random()  # whether it is nonsense
     assert sampler.state_dict()["random"] == rng.getstate()
+
+
+def test_rare_answers_are_drawn_more_often_than_driven(demonstrations, town2, say, labels):
+    subtask, drive, lane = labels
+    driven = {}
+    for segment in find_segments(town2, cut_snippets(subtask, drive), lane)["first left"]:
+        driven[segment.manoeuvres] = driven.get(segment.manoeuvres, 0) + 1
+    assert len(driven) > 1
+    sampler = BoundarySampler(demonstrations, town2, seed=3)
+    index, info = sampler.sample(demonstrations.storage, 4000 * sampler.decisions)
+    shape = (4000, sampler.decisions)
+    rows = index.view(shape), {key: value.view(*shape, *value.shape[1:]) for key, value in info.items()}
+    drawn = [
+        tuple(k for k in target if k not in (FOLLOW, FINISH))
+        for keyword, _, target, _ in sequences(rows)
+        if keyword == "first left"
+    ]
+    weights = {answer: count**0.5 for answer, count in driven.items()}
+    for answer, weight in weights.items():
+        share = weight / sum(weights.values())
+        assert drawn.count(answer) / len(drawn) == pytest.approx(share, abs=0.08), answer
+        if driven[answer] < max(driven.values()):
+            assert share > driven[answer] / sum(driven.values())
 
 
 def test_every_misleading_route_is_a_segment(town):
