@@ -142,7 +142,9 @@ class Passenger:
         """
         own = keyword.name.replace(",", " ").split()
         meant, said = ([word for word in text if word in DIRECTIONS] for text in (own, words))
-        counted = keyword.type != "ordinal" or all((word in words) == (word in own) for word in ORDINALS)
+        # "Just a second, then go left" must not come to "second left". Two steps may be counted as they like.
+        of = {"single": MEANINGFUL, "double": frozenset(), "ordinal": frozenset(ORDINALS)}[keyword.type]
+        counted = of.intersection(words) == of.intersection(own)
         rate = rng.uniform(0.3, 1)
         if said != meant or not counted or not set(words).isdisjoint(NEGATIONS):
             spare = _spoken()["spare"] if said else ()

@@ -155,12 +155,25 @@ def test_shortened_commands_keep_what_says_which_way(passenger, spoken, monkeypa
         ("straight", "at the lights you make no turn", "at the lights you make no turn"),  # names no direction
         ("second left", "let the first left go by and take the second", "let first left go by and take second"),
         ("left,left", "turn left and do the same at the next one", "turn left and do same next one"),
+        ("left", "just a second then please go left", "just second then go left"),
     ],
 )
 def test_commands_that_need_their_words_lose_none_but_spare_ones(passenger, name, sentence, shortest):
     heard = {" ".join(passenger._shorten(KEYWORDS[name], sentence.split(), random.Random(k))) for k in range(200)}
     assert min(heard, key=len) == shortest
     assert all(inside(shortest.split(), some.split()) and inside(some.split(), sentence.split()) for some in heard)
+
+
+def test_no_two_keywords_shorten_to_the_same(passenger):
+    class Terse(random.Random):
+        def uniform(self, low, high):  # of the rate at which words go
+            return high
+
+    rng, meant = Terse(3), {}
+    for name, keyword in KEYWORDS.items():
+        for _ in range(3000):
+            shortest = passenger._shorten(keyword, passenger._phrase(keyword, rng).split(), rng)
+            assert meant.setdefault(tuple(shortest), name) == name
 
 
 def test_a_shortened_command_does_not_turn_its_order_round(passenger):
