@@ -182,9 +182,6 @@ def check(cfg: DictConfig) -> None:
     for name in ("towns", "test_towns", "stages"):
         if not OmegaConf.is_list(cfg[name]):
             raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
-    if not OmegaConf.is_dict(cfg.learning_rate):
-        example = "learning_rate.language=8e-3"
-        raise ValueError(f"learning_rate is {cfg.learning_rate}; give that of a stage, such as {example}")
     unknown = set(cfg.stages) - set(STAGES)
     if unknown:
         raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")

@@ -301,7 +301,6 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
         (["test_towns=[town2,atlantis]"], "'atlantis'"),
         (["size.features=0"], "features is 0; give a whole number above 0"),
         (["size.image_rows=10"], "rows is 10"),
-        (["learning_rate=1e-3"], "learning_rate is 0.001; give that of a stage, such as learning_rate.language=8e-3"),
         (["device=moon"], "moon"),
     ],
 )
