@@ -81,7 +81,7 @@ class Training:
         parameters = [p for loss in losses for p in loss.parameters() if p.requires_grad]
         steps = self.cfg[f"{title}_steps"]
         optimizer = torch.optim.Adam(parameters)
-        rate = self.cfg.learning_rate[title]
+        rate = self.cfg.learning_rate
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps, pct_start=0.1)
         history: dict[str, list[float]] = defaultdict(list)
         bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
