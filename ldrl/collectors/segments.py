@@ -132,7 +132,7 @@ class BoundarySampler(DemonstrationSampler):
     """Draws sequences of high-level decisions at the boundaries between sub-tasks, as many of each keyword.
 
     A keyword is answered in more than one way where it may pass junctions first; one way is drawn with the square root
-    of how often it is driven, since hardly one car in fifty meets a street on the left only at the third junction.
+    of how often it is driven, since hardly one car in a hundred meets a street on the left only at the third junction.
 
     The first decision is where the instruction is given; each later one falls around the end of the sub-task before;
     the last one is ``FINISH``. The batch size of the buffer counts decisions, padding included. Each gets the
