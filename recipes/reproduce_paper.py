@@ -124,7 +124,8 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 recipe, read = EVALUATION, ("evaluate.yaml",)
                 given |= {"checkpoint": taken[0], "out": folder / name / REPORT, **settings.evaluation}
             else:
-                recipe, read = TRAINING, ("bc_hierarchical.yaml", f"preset/{cfg.scale}.yaml", "size/small.yaml")
+                recipe = TRAINING
+                read = ("bc_hierarchical.yaml", "preset/default.yaml", f"preset/{cfg.scale}.yaml", "size/small.yaml")
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}

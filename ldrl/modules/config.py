@@ -68,7 +68,7 @@ class AgentConfig:
     conv_channels: tuple[int, int, int] = (16, 32, 64)
     features: int = 128
     low_level_hidden: int = 64
-    instruction_hidden: int = 256
+    instruction_hidden: int = 384
     subtask_embedding: int = 16
     high_level_hidden: int = 128
 

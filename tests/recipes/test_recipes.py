@@ -418,8 +418,11 @@ def test_presets_and_sizes_have_the_same_keys():
     for group in ("preset", "size"):
         files = sorted((RECIPES / "config" / group).glob("*.yaml"))
         assert len(files) > 1
-        found = [set(leaves(yaml.safe_load(file.read_text()))) - {"name"} for file in files]
-        assert all(keys == found[0] for keys in found)
+        config = {file.stem: yaml.safe_load(file.read_text()) for file in files}
+        found = {name: set(leaves(values)) - {"name"} for name, values in config.items()}
+        for name, keys in found.items():
+            on_top_of = [found[other] for other in config[name].get("defaults", [])]
+            assert keys.union(*on_top_of) == found["smoke" if group == "preset" else "small"]
 
 
 def test_sizes_are_agent_configs():

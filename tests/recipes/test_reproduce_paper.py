@@ -87,7 +87,7 @@ def test_a_command_is_one_that_a_user_can_type(reproduce):
     reproduce("tables=[input,unseen]")
     made = json.loads(Path("runs/paper/seed0/rgb-h0/made.json").read_text())
     assert made["command"] == (
-        "python recipes/bc_hierarchical.py name=paper/seed0/rgb-h0 seed=0 preset=default "
+        "python recipes/bc_hierarchical.py name=paper/seed0/rgb-h0 seed=0 preset=full "
         "'stages=[]' model=h0 modality=rgb start_from.low_level=runs/paper/seed0/rgb-low "
         "start_from.high_level=runs/paper/seed0/gs-h0"
     )
@@ -164,7 +164,7 @@ def test_smoke_leaves_the_page_alone(reproduce):
     ("argument", "message"),
     [
         ("tables=[input,output]", "tables has 'output'; use some of input, models, misleading, language, unseen"),
-        ("scale=huge", "scale has 'huge'; use some of default, smoke"),
+        ("scale=huge", "scale has 'huge'; use some of full, smoke"),
         ("jobs=0", "jobs is 0; give whole numbers of at least 1"),
         ("seeds=[-1]", "seeds is [-1]; give whole numbers of at least 0"),
         ("seeds=[0,0]", "seeds is [0, 0]; give each seed once"),
