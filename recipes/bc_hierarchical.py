@@ -2,6 +2,7 @@
 
     python recipes/bc_hierarchical.py                          # a laptop's preset: the full model on gs
     python recipes/bc_hierarchical.py preset=smoke             # everything once, to see it run
+    python recipes/bc_hierarchical.py preset=full              # as docs/results.md and the shipped weights are made
     python recipes/bc_hierarchical.py name=h0 model=h0             # another of the paper's models
     python recipes/bc_hierarchical.py name=rgb modality=rgb        # from colour images
     python recipes/bc_hierarchical.py name=safe misleading=0.25    # trained for what the map does not allow

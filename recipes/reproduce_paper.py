@@ -59,7 +59,7 @@ class Cell:
     Args:
         folder: where its files go.
         recipe: a file of this folder.
-        settings: the files below ``config`` that it reads.
+        settings: the files below ``config`` that it reads, a later one's values replace an earlier one's.
         arguments: of the recipe.
         needs: folders of the cells that must be finished before, whose checkpoints it takes.
     """
@@ -77,10 +77,10 @@ class Cell:
 
     def origin(self) -> dict[str, Any]:
         """What it is made from: if this has changed, so has the cell."""
-        settings = [OmegaConf.to_container(OmegaConf.load(RECIPES / "config" / file)) for file in self.settings]
+        settings = OmegaConf.merge(*(OmegaConf.load(RECIPES / "config" / file) for file in self.settings))
         return {
             "command": shlex.join(("python", f"recipes/{self.recipe}", *self.arguments)),
-            "settings": digest(json.dumps(settings).encode()),
+            "settings": digest(json.dumps(OmegaConf.to_container(settings)).encode()),
             "weights": [digest((folder / WEIGHTS).read_bytes()) for folder in self.needs],
         }
 

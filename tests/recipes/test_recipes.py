@@ -358,7 +358,7 @@ def test_unknown_presets_are_named(tmp_path, call):
     printed, error = call("bc_hierarchical.py", "preset=atlantis", cwd=tmp_path)
     assert error == 1
     assert "preset/atlantis" in printed
-    assert re.search(r"default\s+smoke", printed)
+    assert re.search(r"default\s+full\s+smoke", printed)
     assert not list(tmp_path.iterdir())
 
 
