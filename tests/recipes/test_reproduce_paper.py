@@ -85,17 +85,19 @@ def test_only_what_a_table_needs(reproduce):
 
 def test_a_command_is_one_that_a_user_can_type(reproduce):
     reproduce("tables=[input,unseen]")
-    made = json.loads(Path("runs/paper/seed0/rgb-h0/made.json").read_text())
-    assert made["command"] == (
+    commands = {path.parent.name: json.loads(path.read_text())["command"] for path in Path("runs").rglob("made.json")}
+    assert commands["rgb-h0"] == (
         "python recipes/bc_hierarchical.py name=paper/seed0/rgb-h0 seed=0 preset=full "
         "'stages=[]' model=h0 modality=rgb start_from.low_level=runs/paper/seed0/rgb-low "
         "start_from.high_level=runs/paper/seed0/gs-h0"
     )
-    made = json.loads(Path("runs/paper/seed0/gs-hih-unseen/made.json").read_text())
-    assert made["command"] == (
+    assert commands["gs-hih-unseen"] == (
         "python recipes/evaluate.py checkpoint=runs/paper/seed0/gs-hih episodes=unseen "
         "out=runs/paper/seed0/gs-hih-unseen/report.json"
     )
+    # What starts from an agent that decides already is trained for less long.
+    longer = {name for name, command in commands.items() if "[high_level]" in command and "_steps" not in command}
+    assert longer == {"gs-hih"}
 
 
 def test_a_finished_cell_is_not_made_again(reproduce):
