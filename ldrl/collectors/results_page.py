@@ -62,7 +62,7 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
 3. **Training towns.** Town 1 and seven random towns, which have what Town 1 lacks: junctions of four streets. Town 2,
    as in the paper, and the unseen towns are in no training.
 4. **Sentences** come from our own templates on the paper's scale; evaluation says held-out ones only.
-5. **Sizes and schedule.** Networks of 1.0 million parameters with normalised convolutions, trained in minutes on two
+5. **Sizes and schedule.** Networks of 1.2 million parameters with normalised convolutions, trained in minutes on two
    CPU cores.
 6. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,
    images are not. It reads both ways. All models but NMC, which lacks the attention, share it.
