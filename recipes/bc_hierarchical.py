@@ -48,7 +48,7 @@ from ldrl.collectors.paper import paper_success
 from ldrl.collectors.plots import plot_losses, plot_tracks
 from ldrl.collectors.report import replacing, table, to_markdown, write_json
 from ldrl.envs import Episode, builtin_episodes, make_camera, misleading_episodes
-from ldrl.modules import MODELS, Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
+from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 from ldrl.towns import Town
 
@@ -178,11 +178,21 @@ def start_from(agent: Agent, checkpoints: Mapping[str, str | None]) -> list[str]
     return copied
 
 
+def reads(copied: Sequence[str]) -> bool:
+    """Whether the encoder of instructions is in what was copied."""
+    encoders = (f"{own}.module.0.module." for own in ("high_level", "policy"))
+    return any(encoder.startswith(f"{part}.") for encoder in encoders for part in copied)
+
+
 def check(cfg: DictConfig) -> None:
     """Raise a ValueError for settings of which nothing can be made."""
     for name in ("towns", "test_towns", "stages"):
         if not OmegaConf.is_list(cfg[name]):
             raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
+        if not cfg[name] and name != "stages":
+            raise ValueError(f"{name} is empty; give at least one, such as {name}=[town1]")
+    if cfg.sentences < cfg.batch_sentences:
+        raise ValueError(f"sentences is {cfg.sentences}; give at least a batch of them, {cfg.batch_sentences}")
     unknown = set(cfg.stages) - set(STAGES)
     if unknown:
         raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
@@ -207,10 +217,14 @@ def write_report(
     episodes = choose_episodes(cfg, towns)
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
         outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
+    trained = [f"{stage}: {count:,} batches" for stage, count in batches.items()]
+    if set(batches) - {"language"}:
+        trained.append(f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}")
+    taken = [f"{level} from {checkpoint}" for level, checkpoint in cfg.start_from.items() if checkpoint]
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
-        "Preset": f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}; "
-        + "; ".join(f"{stage}: {count:,} batches" for stage, count in batches.items()),
+        "Started from": "; ".join(taken) or "nothing",
+        "Trained": "; ".join(trained) or "nothing",
         "Seed": str(cfg.seed),
         "Training": training,
         "Evaluation": f"{time.perf_counter() - began:.0f} s",
@@ -236,13 +250,18 @@ def main(cfg: DictConfig) -> None:
     try:
         check(cfg)
         towns = {town.name: town for town in map(Town.load, cfg.test_towns)}
-        sizes = OmegaConf.to_container(cfg.size)
-        if cfg.misleading and not MODELS[cfg.model].hierarchical:
+        config = AgentConfig(model=cfg.model, modality=cfg.modality, **OmegaConf.to_container(cfg.size))
+        if cfg.misleading and not config.parts.hierarchical:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
-        agent = make_agent(AgentConfig(model=cfg.model, modality=cfg.modality, **sizes)).to(cfg.device)
+        agent = make_agent(config).to(cfg.device)
+        copied = start_from(agent, cfg.start_from)
         if any(cfg.start_from.values()):
-            copied = start_from(agent, cfg.start_from)
             print(f"Taken from trained agents: {', '.join(copied) or 'nothing, as nothing fits'}.")
+        if "high_level" in cfg.stages and "language" not in cfg.stages and not reads(copied):
+            raise ValueError(
+                "stages has high_level, but nothing has learned to read: add language, or set start_from.high_level to "
+                "a checkpoint with the same instruction_hidden"
+            )
         make_camera(next(iter(towns.values())), cfg.modality, appearance=cfg.appearance)
         training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)

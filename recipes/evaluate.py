@@ -27,7 +27,7 @@ from tqdm import tqdm
 from ldrl.collectors import evaluate
 from ldrl.collectors.paper import paper_success
 from ldrl.collectors.report import check_writable, keyword_table, table, write_json
-from ldrl.envs import DashCamera, Episode, builtin_episodes, load_episodes, misleading_episodes
+from ldrl.envs import Episode, builtin_episodes, load_episodes, make_camera, misleading_episodes
 from ldrl.language import Family
 from ldrl.modules import load_agent
 from ldrl.towns import LAYOUTS, Town
@@ -71,7 +71,7 @@ def main(cfg: DictConfig) -> None:
         first = next(chosen)
         if not first[1]:
             raise ValueError(f"no keyword can be realised in {cfg.episodes}; give a map with junctions")
-        DashCamera(next(iter(first[0].values())), appearance=cfg.appearance)
+        make_camera(next(iter(first[0].values())), agent.modality, appearance=cfg.appearance)
         if cfg.out is not None:
             check_writable(str(cfg.out))
     except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
@@ -82,7 +82,8 @@ def main(cfg: DictConfig) -> None:
         for towns, episodes in chain([first], chosen):
             bar.total += len(episodes)
             outcomes += evaluate(agent, episodes, towns, progress=bar.update, **settings)
-    paper = paper_success(agent.config, misleading=cfg.episodes == "misleading")
+    in_paper = cfg.episodes in ("builtin", "misleading")
+    paper = paper_success(agent.config, misleading=cfg.episodes == "misleading") if in_paper else {}
     print(f"{table(outcomes, paper)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
         write_json(outcomes, str(cfg.out))

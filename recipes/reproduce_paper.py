@@ -151,6 +151,7 @@ class Running(NamedTuple):
     """A cell under way."""
 
     cell: Cell
+    origin: dict[str, Any]  # before it started: files may change under way
     process: subprocess.Popen
     began: float
 
@@ -175,7 +176,7 @@ def run(cells: list[Cell], jobs: int) -> list[Cell]:
                     done.add(cell.folder)
                     bar.update()
                 else:
-                    running.append(Running(cell, cell.start(threads), time.time()))
+                    running.append(Running(cell, cell.origin(), cell.start(threads), time.time()))
             bar.set_postfix_str(" ".join(each.cell.name for each in running), refresh=False)
             time.sleep(0.2 if running else 0)
             for each in [each for each in running if each.process.poll() is not None]:
@@ -199,7 +200,7 @@ def close(ended: Running, hardware: str) -> bool:
         tail = (cell.folder / OUTPUT).read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:]
         tqdm.write("\n".join((f"{cell.name} failed; the end of {cell.folder / OUTPUT}:", *tail)))
         return False
-    made = cell.origin() | {
+    made = ended.origin | {
         "began": round(ended.began),
         "seconds": round(seconds, 1),
         "hardware": hardware,

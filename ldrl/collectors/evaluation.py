@@ -152,7 +152,8 @@ def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:
     track = drive[keys.POSE][:, :2]
     path = torch.tensor(episode.path)
     gap = torch.cdist(path, track).amin(1)
-    finish = drive.get(keys.AGENT_FINISH, torch.zeros(len(track), dtype=torch.bool)).nonzero()
+    # Nothing is driven after the last frame: what is chosen there does not count.
+    finish = drive.get(keys.AGENT_FINISH, torch.zeros(len(track), dtype=torch.bool))[:-1].nonzero()
     finish_distance = float((track[finish[0, 0]] - path[-1]).norm()) if len(finish) else None
     collision, off_road, wrong_lane = (
         bool(drive[key].any()) for key in (keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)

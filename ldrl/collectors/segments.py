@@ -236,7 +236,8 @@ class BoundarySampler(DemonstrationSampler):
         first, manoeuvre = segment.snippets[:2]
         begin, boundary = int(self._snippets.start[first]), int(self._snippets.start[manoeuvre])
         earliest = begin if self._random.random() < ANYWHERE else max(begin, boundary + START[0])
-        frame = self._random.randint(earliest, boundary + START[1])
+        # A manoeuvre before which the car should stop may be cut off by its drive's end.
+        frame = min(self._random.randint(earliest, boundary + START[1]), int(self._snippets.drive_end[manoeuvre]) - 1)
         begun = boundary - STOP_IN_SIGHT if segment.manoeuvres[0] == SubTask.FINISH else boundary
         snippets = list(segment.snippets) if frame < begun else list(segment.snippets[1:])
         decisions = [(frame, SubTask(int(self._snippets.subtask[snippets[0]])))]

@@ -75,7 +75,7 @@ class Agent(TensorDictModuleBase):
         """One step.
 
         Args:
-            tensordict: batch size ``[B]`` with ``in_keys``.
+            tensordict: any batch size, with ``in_keys``.
 
         Returns:
             The same, with ``out_keys``: the action, what the agent says about it, and the memory for the next step
@@ -91,6 +91,7 @@ class Agent(TensorDictModuleBase):
             raise KeyError(
                 f"{missing[0]} is missing; give the env a DashCamera, an Instruction and agent.make_tensordict_primer()"
             )
-        if tensordict.batch_dims == 0:
-            return tensordict.update(self(tensordict.unsqueeze(0)).squeeze(0))
+        if tensordict.batch_dims != 1:
+            flat = tensordict.select(*in_keys).reshape(-1)
+            return tensordict.update(self(flat).reshape(tensordict.shape))
         return tensordict.update(self._step(tensordict.select(*in_keys)))

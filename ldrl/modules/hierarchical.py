@@ -24,8 +24,8 @@ __all__ = ["HierarchicalAgent", "make_agent"]
 class HierarchicalAgent(Agent):
     """Language and image in, throttle and steer out: high-level policy, low-level policies, switching controller.
 
-    All parts are attributes and may be replaced by modules with the same keys. A call is one step of a batch of cars;
-    only rows that switch run the high-level policy.
+    All parts are attributes and may be replaced by modules with the same keys and sizes of state. A call is one step of
+    a batch of cars; only rows that switch run the high-level policy.
 
     Args:
         config: with a hierarchical model; None for the paper's full one.

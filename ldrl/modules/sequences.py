@@ -41,7 +41,7 @@ def unroll(policy: InstructedPolicy, sequences: TensorDictBase, mask: Tensor) ->
         module(steps)
     instructions = instructions.select(*_read(recurrent), strict=False)
     known = steps.select(*_read(recurrent), strict=False)
-    state = torch.zeros(len(sequences), policy.hidden, device=sequences.device)
+    state = torch.zeros(len(sequences), policy.hidden, device=mask.device)
     chosen = []
     for inputs in known.split([count for count in mask.sum(0).tolist() if count] or [0]):
         inputs.update(instructions[: len(inputs)])

@@ -48,7 +48,7 @@ class _LowLevelLoss(_ImitationLoss):
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = tensordict.select(*self.shown)
         inputs[keys.AGENT_SUBTASK] = tensordict[self.tensor_keys.subtask]
-        inputs[self.state_key] = torch.zeros(*tensordict.shape, self.hidden, device=tensordict.device)
+        inputs[self.state_key] = torch.zeros(*tensordict.shape, self.hidden, device=inputs[keys.IMAGE].device)
         with self.policy_params.to_module(self.policy), set_recurrent_mode(True):
             return self.policy(inputs)
 
@@ -142,7 +142,8 @@ class KeywordLoss(_ImitationLoss):
     def __init__(self, policy: InstructedPolicy) -> None:
         super().__init__(policy.reader, [keys.INSTRUCTION_TOKENS])
         self.hidden = policy.hidden
-        self.head = nn.Linear(policy.said_size, len(KEYWORDS) + 1)
+        device = next(policy.parameters()).device
+        self.head = nn.Linear(policy.said_size, len(KEYWORDS) + 1, device=device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss.
@@ -155,7 +156,8 @@ class KeywordLoss(_ImitationLoss):
             ``loss_keyword``, a scalar, and ``accuracy_keyword``, the share of sentences understood.
         """
         inputs = tensordict.select(*self.shown).flatten()
-        inputs[keys.HIGH_LEVEL_STATE] = torch.zeros(len(inputs), self.hidden, device=tensordict.device)
+        device = inputs[keys.INSTRUCTION_TOKENS].device
+        inputs[keys.HIGH_LEVEL_STATE] = torch.zeros(len(inputs), self.hidden, device=device)
         with self.policy_params.to_module(self.policy):
             logits = self.head(self.policy(inputs)[keys.SAID])
         target = tensordict[self.tensor_keys.keyword].flatten()

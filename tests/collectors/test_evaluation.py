@@ -96,6 +96,7 @@ def along(last=30.0, y=0.0):
         (drive(along()), True, False),
         (drive(along(), finish=31), True, True),  # declared 14.5 m before the end
         (drive(along(), finish=29), True, False),  # 15.5 m
+        (drive(along(), finish=len(along()) - 1), True, False),  # at the last frame, after which nothing is driven
         (drive(along(60.0), finish=89), True, True),  # 14.5 m behind it
         (drive(along(60.0), finish=91), True, False),
         (drive([(math.nan, math.nan)] * 5, finish=2), False, False),

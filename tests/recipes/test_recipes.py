@@ -204,6 +204,8 @@ def test_evaluate_plans_what_is_asked_for(trained, episodes, towns, tmp_path, ca
     assert error in (None, 0)
     assert found == asked
     assert "100%" in printed
+    # The paper reports nothing of other sentences and other towns.
+    assert ("0.9" in printed.split("| paper |")[1]) == (arguments[0] in ("episodes=builtin", "episodes=misleading"))
 
 
 def test_odd_instructions_are_no_errors(trained, some, tmp_path, call):
@@ -293,6 +295,11 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
     [
         (["towns=[atlantis]"], "'atlantis'"),
         (["towns=town1"], "towns is 'town1'; give a list, such as towns=[town1]"),
+        (["towns=[]"], "towns is empty; give at least one, such as towns=[town1]"),
+        (["test_towns=[]"], "test_towns is empty"),
+        (["sentences=100"], "sentences is 100; give at least a batch of them, 256"),
+        (["stages=[low_level,high_level]"], "nothing has learned to read: add language, or set start_from.high_level"),
+        (["model=hihh", "misleading=0.25"], "'hihh'"),
         (["stages=language"], "stages is 'language'; give a list, such as stages=[language]"),
         (["stages=[language,drawing]"], "stages has 'drawing'; use some of low_level, language, high_level"),
         (["model=single", "misleading=0.25"], "misleading is 0.25 for model single, which cannot stop; set it to 0"),
@@ -329,8 +336,8 @@ def test_settings_that_do_not_fit_show_before_the_sentences_are_learned(tmp_path
 @pytest.mark.parametrize(
     ("arguments", "trained_on", "beside"),
     [
-        (["model=single"], "language: 20 batches; drives: 2 batches", "single, gs"),
-        (["modality=rgb", "misleading=0.25", "stages=[high_level]"], "high_level: 2 batches", "hih, rgb"),
+        (["model=single"], "language: 20 batches; drives: 2 batches; 38,400 frames of", "single, gs"),
+        (["modality=rgb", "misleading=0.25", "stages=[high_level]"], "high_level: 2 batches; 38,400 frames of", "hih, rgb"),
     ],
 )
 def test_other_models_images_and_instructions(trained, tmp_path, call, arguments, trained_on, beside):
@@ -341,7 +348,8 @@ def test_other_models_images_and_instructions(trained, tmp_path, call, arguments
     assert error is None
     assert "Taken from trained agents: " in printed
     report = " ".join((tmp_path / "runs" / "other" / "report.md").read_text().replace("\\", "").split())
-    assert f"{trained_on} |" in report
+    assert f"| Trained | {trained_on}" in report
+    assert f"| Started from | high_level from {cwd}/runs/brief |" in report
     assert f"| {beside} |" in report
     assert load_agent(tmp_path / "runs" / "other")
 

@@ -29,6 +29,9 @@ if folder.name == os.environ.get("BROKEN"):
     (folder / "report.json").write_text("cut o")
     sys.exit("error: the moon is down")
 folder.mkdir(parents=True, exist_ok=True)
+if folder.name == os.environ.get("EDITED"):
+    with Path(sys.argv[0]).with_name("config").joinpath("preset", "full.yaml").open("a") as preset:
+        preset.write("learning_rate: 1\\n")
 if "out" not in given:
     (folder / "agent.safetensors").write_text(" ".join(sys.argv[1:]) + os.environ.get("WEIGHTS", ""))
 records = [
@@ -122,6 +125,15 @@ def test_a_cell_whose_command_changed_is_made_again_with_what_starts_from_it(rep
     assert "seed0/gs-hi: other command than before, so it is made again" in printed
     assert "seed0/gs-hi-misleading: other weights than before, so it is made again" in printed
     assert reproduce(*changed)[0] == []
+
+
+def test_settings_that_change_under_way_are_not_what_a_cell_was_made_with(reproduce, monkeypatch):
+    monkeypatch.setenv("EDITED", "reader")
+    reproduce("tables=[unseen]")
+    monkeypatch.delenv("EDITED")
+    made, _, printed = reproduce("tables=[unseen]")
+    assert sorted(made) == ["seed0/gs-low", "seed0/reader"]
+    assert "seed0/reader: other settings than before, so it is made again" in printed
 
 
 def test_the_same_weights_again_leave_what_starts_from_them(reproduce):
