@@ -63,7 +63,7 @@ print("sub-tasks", rollout["agent", "subtask"].tolist())
 
 # %% [markdown]
 # And it trains, with the loss, the sampler and the camera of the recipe. A few steps show that it learns; the recipe
-# takes thousands.
+# takes 1,200 or more.
 
 # %%
 demonstrations = collect_demonstrations(town, 38_400)

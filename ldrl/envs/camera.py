@@ -56,10 +56,10 @@ class DashCamera(Transform):
         town: what there is to see.
         modality: ``"gs"``, a binary segmentation, one channel: 255 where the ray through the pixel's centre meets the
             drivable surface first; or ``"rgb"``.
-        appearance: of rgb images. One of ``WEATHERS``: the town's own materials in that weather. A number: other
-            materials and weather, the same for the same number. ``"episode"``: a new number at each reset, kept in
-            ``("world", "appearance")`` and read from there in a replay buffer. ``"sample"``: a new number for each
-            image.
+        appearance: of rgb images. ``"clear"``, ``"overcast"``, ``"rain"``, ``"fog"``, ``"sunset"`` or ``"night"``: the
+            town's own materials in that weather. A number: other materials and weather, the same for the same number.
+            ``"episode"``: a new number at each reset, kept in ``("world", "appearance")`` and read from there in a
+            replay buffer. ``"sample"``: a new number for each image.
         lateral: offset of the mount to the right, m.
         yaw: turn of the mount to the right, rad.
         seed: of the numbers drawn; parallel workers need one each, for ``env.set_seed`` does not reach it.

@@ -22,7 +22,7 @@ MAX_TOKENS = 48
 PADDING = 0
 """Token id after the end of a sentence."""
 UNKNOWN = 1
-"""Token id of every word that GloVe does not have."""
+"""Token id of a word that GloVe does not have and that resembles no word of the training sentences."""
 
 RARE = 30_000
 """Words beyond this rank in GloVe are read as a word of a command that they resemble: "frst", "rihgt"."""

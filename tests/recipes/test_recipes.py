@@ -336,8 +336,8 @@ def test_settings_that_do_not_fit_show_before_the_sentences_are_learned(tmp_path
 @pytest.mark.parametrize(
     ("arguments", "trained_on", "beside"),
     [
-        (["model=single"], "language: 20 batches; drives: 2 batches; 38,400 frames of", "single, gs"),
-        (["modality=rgb", "misleading=0.25", "stages=[high_level]"], "high_level: 2 batches; 38,400 frames of", "hih, rgb"),
+        (["model=single"], "language: 20 batches; drives: 2 batches; 38,400", "single, gs"),
+        (["modality=rgb", "misleading=0.25", "stages=[high_level]"], "high_level: 2 batches; 38,400", "hih, rgb"),
     ],
 )
 def test_other_models_images_and_instructions(trained, tmp_path, call, arguments, trained_on, beside):
