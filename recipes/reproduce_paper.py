@@ -129,8 +129,9 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
                 decides = table.get(taken_from.get("high_level"), {}).get("stages", [])
-                if "high_level" in given["stages"] and "high_level" in decides:
-                    given = given | {**settings.again} | given  # its own arguments count
+                if "high_level" in decides:
+                    again = {steps: n for steps, n in settings.again.items() if steps[: -len("_steps")] in given["stages"]}
+                    given = given | again | given  # its own arguments count
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
             cells.append(Cell(folder / name, recipe, read, tuple(argument(*item) for item in given.items()), taken))
     return cells

@@ -29,16 +29,20 @@ PRETRAINED = tuple(sorted(folder.name for folder in SHIPPED.glob("*") if (folder
 """Names of the checkpoints that ship with the package."""
 
 
-def save_agent(agent: Agent, folder: str | Path) -> None:
+def save_agent(agent: Agent, folder: str | Path, dtype: torch.dtype | None = None) -> None:
     """Write a checkpoint; an old one is replaced only once the new one is complete.
 
     Args:
         agent: what to save.
         folder: where; made if missing.
+        dtype: what weights are rounded to in the files, such as ``torch.float16`` for half their size; None leaves them
+            as they are. Once loaded they are float32 again.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: value.detach().cpu().contiguous() for name, value in agent.state_dict().items()}
+    if dtype is not None:
+        weights = {name: value.to(dtype) if value.is_floating_point() else value for name, value in weights.items()}
     save_file(weights, folder / f"{WEIGHTS}.part")
     (folder / f"{CONFIG}.part").write_text(json.dumps(asdict(agent.config), indent=2) + "\n", encoding="utf-8")
     for name in (WEIGHTS, CONFIG):

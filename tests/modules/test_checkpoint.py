@@ -37,6 +37,16 @@ def test_checkpoints_are_small_and_plain(agent, saved):
     assert json.loads((saved / CONFIG).read_text())["conv_channels"] == list(agent.config.conv_channels)
 
 
+def test_half_precision_halves_the_file(agent, saved, tmp_path):
+    save_agent(agent, tmp_path / "half", dtype=torch.float16)
+    sizes = [(folder / WEIGHTS).stat().st_size for folder in (saved, tmp_path / "half")]
+    assert sizes[1] < 0.6 * sizes[0]
+    loaded = load_agent(tmp_path / "half").state_dict()
+    for name, value in load_agent(saved).state_dict().items():
+        assert loaded[name].dtype == value.dtype
+        torch.testing.assert_close(loaded[name], value, rtol=1e-3, atol=1e-7)
+
+
 def test_an_old_checkpoint_is_replaced(agent, saved, tiny):
     other = HierarchicalAgent(tiny)
     save_agent(other, saved)

@@ -23,6 +23,7 @@ def test_ship_with_their_reports_and_are_small():
     for name in PRETRAINED:
         files = {file.name: file.stat().st_size for file in resolve_checkpoint(name).iterdir()}
         assert {"agent.json", "report.md"} <= set(files)
+        assert files.get("agent.safetensors", 0) <= 4 * 2**20
         sizes += sum(files.values())
     assert sizes <= 12 * 2**20
 
