@@ -130,7 +130,8 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 taken_from = given.pop("start_from", {})
                 decides = table.get(taken_from.get("high_level"), {}).get("stages", [])
                 if "high_level" in decides:
-                    again = {steps: n for steps, n in settings.again.items() if steps[: -len("_steps")] in given["stages"]}
+                    steps = (f"{stage}_steps" for stage in given["stages"])
+                    again = {name: settings.again[name] for name in steps if name in settings.again}
                     given = given | again | given  # its own arguments count
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
             cells.append(Cell(folder / name, recipe, read, tuple(argument(*item) for item in given.items()), taken))
