@@ -52,6 +52,7 @@ from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, load_agent, make
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 from ldrl.towns import Town
 
+LOW_LEVEL = ("control", "end_of_subtask")
 STAGES = ("low_level", "language", "high_level")  # the first soon shows whether all settings fit
 
 
@@ -160,7 +161,7 @@ def start_from(agent: Agent, checkpoints: Mapping[str, str | None]) -> list[str]
     """
     # A single policy is made of the parts of a high-level policy.
     own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
-    networks = {"low_level": ("control", "end_of_subtask"), "high_level": (own,)}
+    networks = {"low_level": LOW_LEVEL, "high_level": (own,)}
     copied: list[str] = []
     for level, checkpoint in checkpoints.items():
         if checkpoint is None:
@@ -191,6 +192,8 @@ def check(cfg: DictConfig) -> None:
             raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
         if not cfg[name] and name != "stages":
             raise ValueError(f"{name} is empty; give at least one, such as {name}=[town1]")
+    if not 0 <= cfg.misleading <= 1:
+        raise ValueError(f"misleading is {cfg.misleading}; give a share from 0 to 1")
     if cfg.sentences < cfg.batch_sentences:
         raise ValueError(f"sentences is {cfg.sentences}; give at least a batch of them, {cfg.batch_sentences}")
     unknown = set(cfg.stages) - set(STAGES)
@@ -210,9 +213,15 @@ def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
 
 
 def write_report(
-    cfg: DictConfig, agent: Agent, towns: dict[str, Town], folder: Path, batches: dict[str, int], training: str
+    cfg: DictConfig,
+    agent: Agent,
+    towns: dict[str, Town],
+    folder: Path,
+    copied: Sequence[str],
+    batches: Mapping[str, int],
+    training: str,
 ) -> None:
-    """Evaluate, and write what came of it and of how many batches in which time."""
+    """Evaluate, and write what came of it, from which start, and of how many batches in which time."""
     began = time.perf_counter()
     episodes = choose_episodes(cfg, towns)
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
@@ -220,7 +229,8 @@ def write_report(
     trained = [f"{stage}: {count:,} batches" for stage, count in batches.items()]
     if set(batches) - {"language"}:
         trained.append(f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}")
-    taken = [f"{level} from {checkpoint}" for level, checkpoint in cfg.start_from.items() if checkpoint]
+    levels = {"low_level" if part.startswith(LOW_LEVEL) else "high_level" for part in copied}
+    taken = [f"{level} from {cfg.start_from[level]}" for level in sorted(levels, reverse=True)]
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
         "Started from": "; ".join(taken) or "nothing",
@@ -262,6 +272,12 @@ def main(cfg: DictConfig) -> None:
                 "stages has high_level, but nothing has learned to read: add language, or set start_from.high_level to "
                 "a checkpoint with the same instruction_hidden"
             )
+        stages = [name for name in STAGES if name in cfg.stages and (config.parts.hierarchical or name != "low_level")]
+        if not stages and not copied:
+            raise ValueError(
+                f"stages is {cfg.stages}, so nothing of model {cfg.model} is trained, and nothing is taken from a "
+                "trained agent: add language and high_level, or set start_from"
+            )
         make_camera(next(iter(towns.values())), cfg.modality, appearance=cfg.appearance)
         training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -271,16 +287,15 @@ def main(cfg: DictConfig) -> None:
 
     began = time.perf_counter()
     try:
-        for stage in STAGES:
-            if stage in cfg.stages and not (stage == "low_level" and not isinstance(agent, HierarchicalAgent)):
-                getattr(training, stage)()
+        for stage in stages:
+            getattr(training, stage)()
     except ValueError as error:  # too few demonstrations, or a batch that does not divide
         sys.exit(f"error: {error}")
     save_agent(agent, folder)
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}
     if losses:
         plot_losses(losses, folder / "losses.png")
-    write_report(cfg, agent, towns, folder, training.batches, f"{time.perf_counter() - began:.0f} s")
+    write_report(cfg, agent, towns, folder, copied, training.batches, f"{time.perf_counter() - began:.0f} s")
 
 
 if __name__ == "__main__":

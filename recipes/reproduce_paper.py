@@ -129,7 +129,7 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
                 decides = table.get(taken_from.get("high_level"), {}).get("stages", [])
-                if "high_level" in decides:
+                if "high_level" in decides and "low_level" in taken_from:  # a single policy has no levels
                     steps = (f"{stage}_steps" for stage in given["stages"])
                     again = {name: settings.again[name] for name in steps if name in settings.again}
                     given = given | again | given  # its own arguments count

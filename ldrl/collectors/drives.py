@@ -31,14 +31,14 @@ class DriveSampler(BoundarySampler):
         buffer: demonstrations.
         town: where they were driven.
         length: frames of a sequence; longer drives are cut.
-        settings: those of :class:`BoundarySampler`.
+        seed: of the sampler's own generator.
 
     Raises:
         ValueError: no segment realises a keyword.
     """
 
-    def __init__(self, buffer: TensorDictReplayBuffer, town: Town, length: int = 400, **settings: Any) -> None:
-        super().__init__(buffer, town, **settings)
+    def __init__(self, buffer: TensorDictReplayBuffer, town: Town, length: int = 400, *, seed: int = 0) -> None:
+        super().__init__(buffer, town, seed=seed)
         self.length = length
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[Any, Tensor]]:

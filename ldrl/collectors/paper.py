@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ldrl.modules import AgentConfig
 
-__all__ = ["LEAST_IOU", "SUCCESS", "TARGETS", "Success", "Target", "paper_success"]
+__all__ = ["LEAST_IOU", "MOST_MINUTES", "SUCCESS", "TARGETS", "Success", "Target", "paper_success"]
 
 Success = dict[str, dict[str, float]]
 """Success rates by town and type of keyword; the paper trains on Town 1 and tests on Town 2 too."""
@@ -97,3 +97,5 @@ TARGETS = (
 """What the full model should reach."""
 LEAST_IOU = 0.95
 """Intersection over union of the road that the segmenter should reach."""
+MOST_MINUTES = 120
+"""In which all cells of a seed should be made, on two CPU cores."""

@@ -13,7 +13,8 @@ import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
-from ldrl.envs import builtin_episodes, save_episodes
+from ldrl.collectors import BoundarySampler
+from ldrl.envs import DashCamera, builtin_episodes, save_episodes
 from ldrl.language import KEYWORDS
 from ldrl.modules import AgentConfig, load_agent, make_agent, save_agent
 from ldrl.towns import Town
@@ -302,6 +303,9 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
         (["model=hihh", "misleading=0.25"], "'hihh'"),
         (["stages=language"], "stages is 'language'; give a list, such as stages=[language]"),
         (["stages=[language,drawing]"], "stages has 'drawing'; use some of low_level, language, high_level"),
+        (["model=single", "stages=[low_level]"], "nothing of model single is trained, and nothing is taken"),
+        (["stages=[]"], "nothing of model hih is trained, and nothing is taken from a trained agent"),
+        (["misleading=25"], "misleading is 25; give a share from 0 to 1"),
         (["model=single", "misleading=0.25"], "misleading is 0.25 for model single, which cannot stop; set it to 0"),
         (["start_from.low_level=atlantis"], "no checkpoint 'atlantis'"),
         (["modality=rgb", "appearance=hail"], "weather 'hail' is unknown; use one of clear"),
@@ -352,6 +356,27 @@ def test_other_models_images_and_instructions(trained, tmp_path, call, arguments
     assert f"| Started from | high_level from {cwd}/runs/brief |" in report
     assert f"| {beside} |" in report
     assert load_agent(tmp_path / "runs" / "other")
+
+
+def test_misleading_and_looks_reach_the_training(trained, tmp_path, call, monkeypatch):
+    made = {BoundarySampler: [], DashCamera: []}
+    for kind, calls in made.items():
+
+        def spy(self, *arguments, _init=kind.__init__, _calls=calls, **settings):
+            _calls.append(settings)
+            _init(self, *arguments, **settings)
+
+        monkeypatch.setattr(kind, "__init__", spy)
+    start_from = f"start_from.high_level={trained[0]}/runs/brief"
+    some = ("name=safe", "test_towns=[town2]", "modality=rgb", "appearance=7", "misleading=0.25", "stages=[high_level]")
+    _, error = call("bc_hierarchical.py", *BRIEF, *TINY, *some, start_from, cwd=tmp_path)
+    assert error is None
+    assert [settings["misleading"] for settings in made[BoundarySampler]] == [0.25]
+    looks = [settings["appearance"] for settings in made[DashCamera]]
+    assert looks[:2] == [7, 7]  # the check of the settings, and the images of the training
+    assert set(looks[2:]) == {"clear"}
+    driven = json.loads((tmp_path / "runs" / "safe" / "report.json").read_text())["episodes"]
+    assert all("-misleading-" in record["id"] for record in driven)
 
 
 def test_unwritable_run_folder(tmp_path, call):

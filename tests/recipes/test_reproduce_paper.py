@@ -2,17 +2,20 @@
 
 import json
 import runpy
+import shlex
 import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 from ldrl.collectors import results_page
 from ldrl.collectors.paper import SUCCESS, TARGETS
 from ldrl.collectors.results import Results
+from ldrl.modules import AgentConfig
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 CONFIG = yaml.safe_load((RECIPES / "config" / "reproduce_paper.yaml").read_text())
@@ -87,7 +90,7 @@ def test_only_what_a_table_needs(reproduce):
 
 
 def test_a_command_is_one_that_a_user_can_type(reproduce):
-    reproduce("tables=[input,unseen]")
+    reproduce()
     commands = {path.parent.name: json.loads(path.read_text())["command"] for path in Path("runs").rglob("made.json")}
     assert commands["rgb-h0"] == (
         "python recipes/bc_hierarchical.py name=paper/seed0/rgb-h0 seed=0 preset=full "
@@ -100,7 +103,24 @@ def test_a_command_is_one_that_a_user_can_type(reproduce):
     )
     # What starts from an agent that decides already is trained for less long.
     longer = {name for name, command in commands.items() if "[high_level]" in command and "_steps" not in command}
-    assert longer == {"gs-hih"}
+    assert longer == {"gs-hih", "gs-single", "gs-single-history"}
+    assert "language_steps=3000 high_level_steps=1200" in commands["gs-nmc"]
+
+
+@pytest.mark.parametrize("scale", CONFIG["scales"])
+def test_the_recipes_take_the_commands(reproduce, scale):
+    """What the pretending recipes take, the real ones take too."""
+    _, error, _ = reproduce(f"scale={scale}")
+    assert error is None
+    commands = [json.loads(path.read_text())["command"] for path in Path("runs").rglob("made.json")]
+    assert len(commands) == len(CONFIG["cells"])
+    with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
+        for command in commands:
+            recipe, *arguments = shlex.split(command)[1:]
+            cfg = compose(Path(recipe).stem, overrides=arguments)
+            if "bc_hierarchical" in recipe:
+                runpy.run_path(str(RECIPES / "bc_hierarchical.py"))["check"](cfg)
+                AgentConfig(model=cfg.model, modality=cfg.modality, **cfg.size)
 
 
 def test_a_finished_cell_is_not_made_again(reproduce):
