@@ -192,6 +192,8 @@ def run(cells: list[Cell], jobs: int) -> list[Cell]:
         bar.close()
         for each in running:
             each.process.terminate()
+        for each in running:
+            each.process.wait()
     return failed
 
 

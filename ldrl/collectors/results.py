@@ -92,15 +92,22 @@ def _has_four_way(town: str) -> bool:
 
 
 def read_cells(folder: str | Path) -> list[Result]:
-    """The finished cells in ``<folder>/seed<k>/<cell>/``."""
+    """The finished cells in ``<folder>/seed<k>/<cell>/``.
+
+    Raises:
+        ValueError: a cell's files are broken.
+    """
     found = []
     for made in sorted(Path(folder).glob(f"seed*/*/{MADE}")):
         report, seed = made.with_name(REPORT), made.parent.parent.name.removeprefix("seed")
         if report.is_file() and seed.isdecimal():
-            about = json.loads(made.read_text(encoding="utf-8"))
-            about = {field.name: about[field.name] for field in fields(Result) if field.name in about}
-            rates = measure(json.loads(report.read_text(encoding="utf-8"))["episodes"])
-            found.append(Result(made.parent.name, int(seed), **about, rates=rates))
+            try:
+                about = json.loads(made.read_text(encoding="utf-8"))
+                about = {field.name: about[field.name] for field in fields(Result) if field.name in about}
+                rates = measure(json.loads(report.read_text(encoding="utf-8"))["episodes"])
+                found.append(Result(made.parent.name, int(seed), **about, rates=rates))
+            except (ValueError, TypeError, KeyError) as error:
+                raise ValueError(f"{made.parent} is no finished cell ({error!r}); delete it and run again") from None
     return found
 
 

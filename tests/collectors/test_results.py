@@ -101,6 +101,16 @@ def test_a_broken_file_is_named(tmp_path, text):
         Results.load(tmp_path / "r.json")
 
 
+@pytest.mark.parametrize("made", ["{", "[]", '{"command": "c"}'])
+def test_a_broken_cell_is_named(tmp_path, made):
+    folder = tmp_path / "seed0" / "gs-hih"
+    folder.mkdir(parents=True)
+    (folder / "made.json").write_text(made)
+    (folder / "report.json").write_text('{"episodes": []}')
+    with pytest.raises(ValueError, match=r"gs-hih is no finished cell .*; delete it and run again"):
+        read_cells(tmp_path)
+
+
 def test_only_finished_cells_are_read(tmp_path):
     about = {"command": "c", "weights": [], "began": 1, "seconds": 2, "hardware": "h", "versions": "v"}
     for cell, files in (("whole", "mr"), ("made", "m"), ("reported", "r")):
