@@ -13,6 +13,7 @@ Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of 
 
 from __future__ import annotations
 
+import math
 import platform
 import shutil
 import sys
@@ -91,17 +92,21 @@ class Training:
             batch = buffers[step % len(buffers)].sample().reshape(rows, -1).to(self.cfg.device)
             outputs = [loss(batch) for loss in losses]
             sum(value for output in outputs for name, value in output.items() if name.startswith("loss_")).backward()
-            torch.nn.utils.clip_grad_norm_(parameters, self.cfg.max_grad_norm)
-            optimizer.step()
+            norm = torch.nn.utils.clip_grad_norm_(parameters, self.cfg.max_grad_norm)
+            if norm.isfinite():  # through hundreds of frames it may overflow, and one such step would ruin all
+                optimizer.step()
             optimizer.zero_grad()
             schedule.step()
             measured = {name: float(value.detach()) for output in outputs for name, value in output.items()}
+            measured[f"gradient_norm_{title}"] = float(norm)
             bar.set_postfix({name.removeprefix("loss_"): f"{value:.3f}" for name, value in measured.items()})
             for name, value in measured.items():
                 history[name].append(value)
                 self.logger.log_scalar(name, value, step)
         self.history |= history
-        self.batches[title] = steps
+        self.batches[title] = sum(math.isfinite(norm) for norm in history[f"gradient_norm_{title}"])
+        if self.batches[title] < steps:
+            print(f"{steps - self.batches[title]} of {steps} batches were left out, their gradient was not finite.")
 
     def views(self, samplers: Sequence[Sampler], frames: int, length: int, **disturbed: float) -> list[Buffer]:
         """For each town a buffer over its demonstrations that draws images, seen from disturbed poses, when sampled."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import re
 import runpy
@@ -10,8 +11,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from torch import nn
+from torchrl.record import CSVLogger
 
 from ldrl.collectors import BoundarySampler
 from ldrl.envs import DashCamera, builtin_episodes, save_episodes
@@ -128,7 +134,7 @@ def test_losses_are_logged(trained):
     assert {"loss_keyword", "loss_control", "loss_end_of_subtask", "loss_subtask"} <= set(logs)
     for name, path in logs.items():
         rows = list(csv.reader(path.open()))
-        assert [float(row[0]) for row in rows] == list(range(20 if "keyword" in name else 2))
+        assert [float(row[0]) for row in rows] == list(range(20 if "keyword" in name or "language" in name else 2))
         assert all(float(row[1]) >= 0 for row in rows)
     accuracies = [name for name in logs if "accuracy" in name]
     assert len(accuracies) == 3  # of three stages, not mixed
@@ -377,6 +383,33 @@ def test_misleading_and_looks_reach_the_training(trained, tmp_path, call, monkey
     assert set(looks[2:]) == {"clear"}
     driven = json.loads((tmp_path / "runs" / "safe" / "report.json").read_text())["episodes"]
     assert all("-misleading-" in record["id"] for record in driven)
+
+
+def test_a_batch_whose_gradient_overflows_is_left_out_and_told(tmp_path, capsys):
+    class Overflows(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = nn.Parameter(torch.ones(()))
+            self.factors = iter([1.0, math.inf, 1.0])
+
+        def forward(self, batch):
+            return TensorDict({"loss_it": self.weight * next(self.factors)})
+
+    class Buffer:
+        def sample(self):
+            return TensorDict({}, [4])
+
+    kind = runpy.run_path(str(RECIPES / "bc_hierarchical.py"), run_name="recipe")["Training"]
+    training, loss = kind.__new__(kind), Overflows()
+    settings = {"it_steps": 3, "learning_rate": 0.1, "max_grad_norm": 1.0, "device": "cpu"}
+    training.cfg, training.history, training.batches = OmegaConf.create(settings), {}, {}
+    training.logger = CSVLogger("log", str(tmp_path))
+    training.fit("it", [loss], [Buffer()], 4)
+    assert loss.weight.isfinite()
+    assert loss.weight < 1
+    assert training.batches == {"it": 2}
+    assert training.history["gradient_norm_it"] == [1.0, math.inf, 1.0]
+    assert "1 of 3 batches were left out, their gradient was not finite." in capsys.readouterr().out
 
 
 def test_unwritable_run_folder(tmp_path, call):
