@@ -98,8 +98,8 @@ class Training:
             optimizer.zero_grad()
             schedule.step()
             measured = {name: float(value.detach()) for output in outputs for name, value in output.items()}
-            measured[f"gradient_norm_{title}"] = float(norm)
             bar.set_postfix({name.removeprefix("loss_"): f"{value:.3f}" for name, value in measured.items()})
+            measured[f"gradient_norm_{title}"] = float(norm)
             for name, value in measured.items():
                 history[name].append(value)
                 self.logger.log_scalar(name, value, step)
