@@ -217,16 +217,9 @@ def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
     return episodes
 
 
-def write_report(
-    cfg: DictConfig,
-    agent: Agent,
-    towns: dict[str, Town],
-    folder: Path,
-    copied: Sequence[str],
-    batches: Mapping[str, int],
-    training: str,
-) -> None:
+def write_report(training: Training, towns: dict[str, Town], copied: Sequence[str], seconds: float) -> None:
     """Evaluate, and write what came of it, from which start, and of how many batches in which time."""
+    cfg, agent, folder, batches = training.cfg, training.agent, training.folder, training.batches
     began = time.perf_counter()
     episodes = choose_episodes(cfg, towns)
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
@@ -241,7 +234,7 @@ def write_report(
         "Started from": "; ".join(taken) or "nothing",
         "Trained": "; ".join(trained) or "nothing",
         "Seed": str(cfg.seed),
-        "Training": training,
+        "Training": f"{seconds:.0f} s",
         "Evaluation": f"{time.perf_counter() - began:.0f} s",
         "Hardware": f"{platform.machine()}, {torch.get_num_threads()} threads, device {cfg.device}",
         "Versions": f"Python {platform.python_version()}, torch {torch.__version__}",
@@ -300,7 +293,7 @@ def main(cfg: DictConfig) -> None:
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}
     if losses:
         plot_losses(losses, folder / "losses.png")
-    write_report(cfg, agent, towns, folder, copied, training.batches, f"{time.perf_counter() - began:.0f} s")
+    write_report(training, towns, copied, time.perf_counter() - began)
 
 
 if __name__ == "__main__":
