@@ -51,7 +51,7 @@ The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_p
   also never off the road, never in an oncoming lane, and `finish` declared within 15 m of the path's end. *paper*: what
   it reports as success, on routes of its own in CARLA; train is Town 1, test Town 2.
 - Trained in Town 1 and seven random towns. Episodes are all routes of our planner in Town 1 and Town 2, each driven
-  once, said in sentences without a phrase of the training's.
+  once, said in sentences without a phrase of the training's templates.
 - A figure is the mean over the seeds, in brackets the least and the largest of them. "-" is not measured yet, or not
   reported by the paper."""
 DEPARTURES = """\
@@ -59,8 +59,8 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
 
 1. **World.** Flat towns drawn from their lanes instead of CARLA. On rgb the figures compare worlds as well as agents:
    CARLA's images are other ones than ours, and nobody has driven either agent in the other's.
-2. **Episodes** are all routes of our planner, not the paper's 159 and 142, which are not published; `all` mixes the
-   types in another proportion.
+2. **Episodes** are all routes of our planner, so that nobody chooses among them, not the paper's 159 and 142; `all`
+   mixes the types in another proportion.
 3. **Training towns.** Town 1 and seven random towns, which have what Town 1 lacks: junctions of four streets. Town 2,
    as in the paper, and the unseen towns are in no training; but the seven were chosen, for the width of their lanes,
    after strict success in Town 2 and what was lost in unseen towns had shown that the width matters.
@@ -71,8 +71,8 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
    images are not. It reads both ways.
 7. **Models share what they can**, so that a table takes minutes: the low level is that of Hih where the paper's differ
    in the high level only, and the high level of H0, Hi, NMC and the single policies starts from Hih's. NMC learns to
-   read anew from the words' encoder, without the attention. What is only trained on is less than Hih's 2,400 batches:
-   1,200, and 250 of whole drives for the single policies.
+   read anew from the words' encoder, without the attention. So they are trained for less long than Hih with its 2,400
+   batches: for 1,200, the single policies for 250 of whole drives.
 8. **Training on rgb starts from the agent on gs**: the same road in other colours, which saves most of it. **ps is not
    trained on**: agents trained on gs drive on it as they are. H0's high level sees no image, so that on rgb and ps it
    is that of gs.
