@@ -4,6 +4,7 @@ import json
 import runpy
 import shlex
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -68,7 +69,9 @@ def reproduce(tmp_path, monkeypatch, capsys):
             GlobalHydra.instance().clear()
         return calls.read_text().split(), error, "".join(capsys.readouterr())
 
-    return reproduce
+    handler = signal.getsignal(signal.SIGTERM)  # the recipe sets one
+    yield reproduce
+    signal.signal(signal.SIGTERM, handler)
 
 
 def test_every_cell_once_and_after_what_it_needs(reproduce):
