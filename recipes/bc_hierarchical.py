@@ -44,6 +44,7 @@ from ldrl.collectors import (
     collect_demonstrations,
     collect_sentences,
     evaluate,
+    load_demonstrations,
 )
 from ldrl.collectors.paper import paper_success
 from ldrl.collectors.plots import plot_losses, plot_tracks
@@ -71,12 +72,17 @@ class Training:
 
     @cached_property
     def driven(self) -> list[tuple[Town, Buffer, int]]:
-        """Towns, the demonstrations there and seeds for what is drawn from them."""
-        driven = []
+        """Towns, the demonstrations there, collected or an earlier run's, and seeds for what is drawn from them."""
+        cfg, driven = self.cfg, []
         for k, town in enumerate(tqdm(self.towns, "demonstrations", unit="town")):
-            path = self.folder / "demonstrations" / town.name
-            demonstrations = collect_demonstrations(town, self.cfg.demonstration_frames, path=path, seed=self.cfg.seed)
-            driven.append((town, demonstrations, 100 * self.cfg.seed + k))
+            path = Path(cfg.start_from.demonstrations or self.folder) / "demonstrations" / town.name
+            if cfg.start_from.demonstrations is None:
+                demonstrations = collect_demonstrations(town, cfg.demonstration_frames, path=path, seed=cfg.seed)
+            else:
+                demonstrations = load_demonstrations(path)
+                if len(demonstrations) != cfg.demonstration_frames:
+                    raise ValueError(f"{path} has {len(demonstrations)} frames; set demonstration_frames to this")
+            driven.append((town, demonstrations, 100 * cfg.seed + k))
         return driven
 
     def fit(self, title: str, losses: Sequence[LossModule], buffers: Sequence[Buffer], rows: int) -> None:
@@ -154,12 +160,12 @@ class Training:
         encoder.requires_grad_(True)
 
 
-def start_from(agent: Agent, checkpoints: Mapping[str, str | None]) -> list[str]:
+def start_from(agent: Agent, earlier: Mapping[str, str | None]) -> list[str]:
     """Copy the largest parts of trained agents that fit: same name, same tensors.
 
     Args:
         agent: what is to be trained.
-        checkpoints: where ``low_level`` and ``high_level`` are taken from.
+        earlier: checkpoints that ``low_level`` and ``high_level`` are taken from; what else is named is no part.
 
     Returns:
         The names of the parts.
@@ -168,12 +174,13 @@ def start_from(agent: Agent, checkpoints: Mapping[str, str | None]) -> list[str]
     own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
     networks = {"low_level": LOW_LEVEL, "high_level": (own,)}
     copied: list[str] = []
-    for level, checkpoint in checkpoints.items():
+    for level, parts in networks.items():
+        checkpoint = earlier[level]
         if checkpoint is None:
             continue
         trained = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
         for name, module in agent.named_modules():
-            if name.split(".")[0] not in networks[level] or any(name.startswith(f"{part}.") for part in copied):
+            if name.split(".")[0] not in parts or any(name.startswith(f"{part}.") for part in copied):
                 continue
             theirs, shapes = trained.get(name), {key: value.shape for key, value in module.state_dict().items()}
             if not shapes or type(theirs) is not type(module):
@@ -263,7 +270,7 @@ def main(cfg: DictConfig) -> None:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
         agent = make_agent(config).to(cfg.device)
         copied = start_from(agent, cfg.start_from)
-        if any(cfg.start_from.values()):
+        if cfg.start_from.low_level or cfg.start_from.high_level:
             print(f"Taken from trained agents: {', '.join(copied) or 'nothing, as nothing fits'}.")
         if "high_level" in cfg.stages and "language" not in cfg.stages and not reads(copied):
             raise ValueError(
@@ -287,7 +294,7 @@ def main(cfg: DictConfig) -> None:
     try:
         for stage in stages:
             getattr(training, stage)()
-    except ValueError as error:  # too few demonstrations, or a batch that does not divide
+    except (OSError, ValueError) as error:  # none or too few demonstrations, or a batch that does not divide
         sys.exit(f"error: {error}")
     save_agent(agent, folder)
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}

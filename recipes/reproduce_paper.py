@@ -133,6 +133,8 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                     steps = (f"{stage}_steps" for stage in given["stages"])
                     again = {name: settings.again[name] for name in steps if name in settings.again}
                     given = given | again | given  # its own arguments count
+                if taken_from and given["stages"]:
+                    taken_from["demonstrations"] = cfg.collects
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
             cells.append(Cell(folder / name, recipe, read, tuple(argument(*item) for item in given.items()), taken))
     return cells

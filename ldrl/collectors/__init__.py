@@ -1,6 +1,6 @@
 """The expert, demonstrations and what is sampled from them, evaluation and reports."""
 
-from ldrl.collectors.demonstrations import SteeringNoise, collect_demonstrations
+from ldrl.collectors.demonstrations import SteeringNoise, collect_demonstrations, load_demonstrations
 from ldrl.collectors.drives import DriveSampler, OncePerFrame
 from ldrl.collectors.evaluation import Outcome, evaluate
 from ldrl.collectors.expert import Expert, expert_action
@@ -26,4 +26,5 @@ __all__ = [
     "expert_action",
     "find_misleading",
     "find_segments",
+    "load_demonstrations",
 ]

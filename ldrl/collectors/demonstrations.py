@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer, TensorStorage
 from torchrl.envs import TransformedEnv
 
 from ldrl import keys
@@ -16,7 +16,7 @@ from ldrl.collectors.expert import Expert
 from ldrl.envs import SubtaskLabels, TownEnv
 from ldrl.towns import Town
 
-__all__ = ["TRAJECTORY", "SteeringNoise", "collect_demonstrations"]
+__all__ = ["TRAJECTORY", "SteeringNoise", "collect_demonstrations", "load_demonstrations"]
 
 TRAJECTORY = ("collector", "traj_ids")
 """Which drive a frame belongs to, ``[N]`` int64."""
@@ -80,7 +80,7 @@ def collect_demonstrations(
         town: where to drive.
         frames: how many frames, a multiple of ``num_cars``.
         num_cars: cars that drive side by side; each drives ``frames / num_cars`` frames.
-        path: folder of the memory-mapped storage; None for temporary files.
+        path: folder of the memory-mapped storage, for :func:`load_demonstrations`; None for temporary files.
         noise: scale of :class:`SteeringNoise`.
         seed: of cars and noise.
 
@@ -111,3 +111,14 @@ def collect_demonstrations(
     finally:
         collector.shutdown()
     return buffer
+
+
+def load_demonstrations(path: str | Path) -> TensorDictReplayBuffer:
+    """The buffer that :func:`collect_demonstrations` stored in ``path``, memory-mapped.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    if not (Path(path) / "meta.json").is_file():
+        raise FileNotFoundError(f"no demonstrations in {str(path)!r}; give a folder that collect_demonstrations wrote")
+    return TensorDictReplayBuffer(storage=TensorStorage(TensorDict.load_memmap(path)))

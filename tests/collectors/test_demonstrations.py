@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from ldrl import keys
-from ldrl.collectors import SteeringNoise, collect_demonstrations, expert_action
+from ldrl.collectors import SteeringNoise, collect_demonstrations, expert_action, load_demonstrations
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.envs.labels import route_subtask
 
@@ -108,3 +108,12 @@ def test_noise_is_smooth_scaled_and_clipped():
     assert not noise_of(SteeringNoise(0.0))[..., 1].any()
     assert noise_of(SteeringNoise(5.0))[..., 1].abs().max() == 1
     assert noise_of(SteeringNoise(), action=(0.25, 1.0))[..., 1].max() == 1
+
+
+def test_demonstrations_are_loaded_as_they_were_collected(town2, tmp_path):
+    collected = collect_demonstrations(town2, 120, num_cars=4, path=tmp_path / "town2")
+    loaded = load_demonstrations(tmp_path / "town2")
+    assert len(loaded) == 120
+    assert (loaded.storage[:] == collected.storage[:]).all()
+    with pytest.raises(FileNotFoundError, match="no demonstrations in .*atlantis"):
+        load_demonstrations(tmp_path / "atlantis")
