@@ -111,6 +111,9 @@ class Cell:
 def make_cells(cfg: DictConfig) -> list[Cell]:
     """The cells that the tables need, for every seed."""
     table, settings = OmegaConf.to_container(cfg.cells), cfg.scales[cfg.scale]
+    for given in table.values():
+        if given.get("stages") and "start_from" in given:
+            given["start_from"]["demonstrations"] = cfg.collects
     wanted = [cell for title in cfg.tables for cell in cfg.contents[title]]
     for name in wanted:  # grows on the way
         wanted += [needed for needed in needs(table[name]) if needed not in wanted]
@@ -130,11 +133,9 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 taken_from = given.pop("start_from", {})
                 decides = table.get(taken_from.get("high_level"), {}).get("stages", [])
                 if "high_level" in decides and "low_level" in taken_from:  # a single policy has no levels
-                    steps = (f"{stage}_steps" for stage in given["stages"])
-                    again = {name: settings.again[name] for name in steps if name in settings.again}
-                    given = given | again | given  # its own arguments count
-                if taken_from and given["stages"]:
-                    taken_from["demonstrations"] = cfg.collects
+                    for steps in (f"{stage}_steps" for stage in given["stages"]):
+                        if steps in settings.again:
+                            given.setdefault(steps, settings.again[steps])
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
             cells.append(Cell(folder / name, recipe, read, tuple(argument(*item) for item in given.items()), taken))
     return cells

@@ -61,7 +61,8 @@ class SteeringNoise(TensorDictModuleBase):
         fresh = torch.randn(action.shape[:-1], generator=self._generator).to(action.device)
         if self._process is None or self._process.shape != fresh.shape:
             self._process = fresh
-        self._process = self.correlation * self._process + (1 - self.correlation**2) ** 0.5 * fresh
+        else:
+            self._process = self.correlation * self._process + (1 - self.correlation**2) ** 0.5 * fresh
         burst = self._process - self._process.clamp(-1, 1)
         steer = (action[..., 1] + self.scale * burst).clamp(-1, 1)
         tensordict[keys.ACTION] = torch.stack((action[..., 0], steer), -1)

@@ -64,7 +64,7 @@ class DriveSampler(BoundarySampler):
         frames = torch.tensor(first).unsqueeze(-1) + steps
         end = torch.tensor(last).unsqueeze(-1)
         info = {
-            keys.INSTRUCTION_TOKENS: self._tokenizer(sentences).repeat_interleave(self.length, 0),
+            keys.INSTRUCTION_TOKENS: self._passenger.tokenizer(sentences).repeat_interleave(self.length, 0),
             "mask": (frames <= end).flatten(),
         }
         return frames.minimum(end).flatten(), info

@@ -16,7 +16,7 @@ from torchrl.data.replay_buffers import Storage
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
 from ldrl.collectors.snippets import DemonstrationSampler, Snippets, cut_snippets
-from ldrl.language import KEYWORDS, SAFE_KEYWORDS, Keyword, Passenger, Tokenizer, realised_by
+from ldrl.language import KEYWORDS, SAFE_KEYWORDS, Keyword, Passenger, realised_by
 from ldrl.modules.high_level import NO_SUBTASK
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
@@ -141,7 +141,6 @@ class BoundarySampler(DemonstrationSampler):
     Args:
         buffer: demonstrations.
         town: where they were driven.
-        tokenizer: writes the instructions.
         max_junctions: see :func:`find_segments`.
         misleading: share of the instructions that ask for what the map does not allow, singles and doubles; answered
             safely, see :data:`~ldrl.language.SAFE_KEYWORDS`.
@@ -155,7 +154,6 @@ class BoundarySampler(DemonstrationSampler):
         self,
         buffer: TensorDictReplayBuffer,
         town: Town,
-        tokenizer: Tokenizer | None = None,
         *,
         max_junctions: int = 3,
         misleading: float = 0.0,
@@ -175,8 +173,7 @@ class BoundarySampler(DemonstrationSampler):
         if lacking:
             raise ValueError(f"no drive in {len(stored)} frames is misled by {', '.join(lacking)}; collect more")
         self.decisions = 2 * max_junctions + 1
-        self._tokenizer = Tokenizer() if tokenizer is None else tokenizer
-        self._passenger = Passenger(self._tokenizer.glove, self._tokenizer.max_tokens)
+        self._passenger = Passenger()
         self.misleading = misleading
         self._random = random.Random(seed)
 
@@ -206,7 +203,7 @@ class BoundarySampler(DemonstrationSampler):
             targets.append(chosen + [int(SubTask.FINISH)] * padding)
             previous.append([NO_SUBTASK, *chosen[:-1]] + [NO_SUBTASK] * padding)
             sentences.append((sentence, len(sequence)))
-        tokens = self._tokenizer([sentence for sentence, _ in sentences])
+        tokens = self._passenger.tokenizer([sentence for sentence, _ in sentences])
         length = torch.tensor([n for _, n in sentences])
         info = {
             keys.SUBTASK: torch.tensor(targets).flatten(),

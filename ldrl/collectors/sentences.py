@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from ldrl import keys
 from ldrl.collectors.demonstrations import TRAJECTORY
-from ldrl.language import KEYWORDS, PADDING, Passenger, Tokenizer
+from ldrl.language import KEYWORDS, PADDING, Passenger
 
 __all__ = ["collect_sentences"]
 
@@ -18,9 +18,7 @@ NONSENSE = 0.05
 """Share of sentences that ask for nothing."""
 
 
-def collect_sentences(
-    count: int, batch_size: int, tokenizer: Tokenizer | None = None, seed: int = 0
-) -> TensorDictReplayBuffer:
+def collect_sentences(count: int, batch_size: int, seed: int = 0) -> TensorDictReplayBuffer:
     """What passengers say, as many sentences of each keyword, and some that ask for nothing.
 
     A sample holds sentences of about the same length, so that little is padding: they are stored from short to long,
@@ -29,15 +27,13 @@ def collect_sentences(
     Args:
         count: how many sentences.
         batch_size: of a sample.
-        tokenizer: writes them.
         seed: of what they say.
 
     Returns:
         A buffer of ``instruction_tokens``, ``[48]`` int64, and ``keyword``, ``[]`` int64: its index among
         :data:`~ldrl.language.KEYWORDS`, or their number where nothing is asked for.
     """
-    tokenizer = Tokenizer() if tokenizer is None else tokenizer
-    rng, passenger = random.Random(seed), Passenger(tokenizer.glove, tokenizer.max_tokens)
+    rng, passenger = random.Random(seed), Passenger()
     sentences, meant = [], []
     for _ in range(count):
         keyword = len(KEYWORDS) if rng.random() < NONSENSE else rng.randrange(len(KEYWORDS))
@@ -50,7 +46,7 @@ def collect_sentences(
         batch_size=batch_size,
         generator=torch.Generator().manual_seed(seed),
     )
-    tokens = tokenizer(sentences)
+    tokens = passenger.tokenizer(sentences)
     by_length = (tokens != PADDING).sum(-1).argsort(stable=True)
     said = {keys.INSTRUCTION_TOKENS: tokens, keys.KEYWORD: torch.tensor(meant)}
     buffer.extend(TensorDict(said, [count])[by_length].set(TRAJECTORY, torch.zeros(count, dtype=torch.long)))

@@ -114,9 +114,8 @@ def builtin_episodes(
     """
     rng = random.Random(f"{town.name}-{seed}")
     heldout = Sentences("heldout")
-    others: Sentences | Families | None = None
-    if split != "heldout":
-        others = Sentences("train") if split == "train" else Families(split)
+    train = Sentences("train") if split == "train" else None
+    family = None if split in ("heldout", "train") else Families(split)
     others_rng = random.Random(f"{town.name}-{seed}-{split}")
     episodes = []
     for keyword in KEYWORDS.values():
@@ -133,8 +132,10 @@ def builtin_episodes(
             driven = replace(route, start=float(town.lane_length[route.lanes[0]]) - start, end=end)
             # Drawn for every split: the starts that follow depend on it.
             instruction = heldout.sample(keyword, rng)
-            if others is not None:
-                instruction = others.sample(keyword, others_rng)
+            if train is not None:
+                instruction = train.sample(keyword, others_rng)
+            if family is not None:
+                instruction = family.sample(keyword, others_rng, clean=instruction)
             episodes.append(episode_along(driven, name, keyword, instruction))
     return episodes
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from ldrl.language.families import Families, Family
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
-from ldrl.language.passenger import MEANINGFUL, Passenger
+from ldrl.language.passenger import Passenger
 from ldrl.language.sentences import Sentences, Split
+from ldrl.language.spoken import MEANINGFUL
 from ldrl.language.tokens import MAX_TOKENS, PADDING, UNKNOWN, Tokenizer, normalise
 
 __all__ = [

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import resources
+from itertools import product
 from typing import Literal, get_args
 
 import yaml
@@ -46,12 +48,13 @@ class Families:
         self.family = family
         self._clean = Sentences("heldout")
 
-    def sample(self, keyword: str | Keyword, rng: random.Random) -> str:
+    def sample(self, keyword: str | Keyword, rng: random.Random, clean: str | None = None) -> str:
         """Draws a pattern of the keyword, then each of its parts, all uniformly.
 
         Args:
             keyword: any spelling that :meth:`Keyword.parse` knows.
             rng: the source of randomness; nothing else decides.
+            clean: the sentence that is disturbed, in noise and rambling; None draws a held-out one.
 
         Returns:
             The sentence, with case and punctuation.
@@ -60,11 +63,27 @@ class Families:
             ValueError: there is no such keyword.
         """
         keyword = Keyword.parse(keyword)
+        clean = self._clean.sample(keyword, rng) if clean is None else clean
         if self.family == "noise":
-            return slip(self._clean.sample(keyword, rng), rng)
+            return slip(clean, rng)
         slots = rng.choice(_patterns(self.family, keyword.name))
-        parts = [self._clean.sample(keyword, rng) if parts is None else rng.choice(parts) for parts in slots]
-        return " ".join(filter(None, parts)).replace(" ,", ",").strip(" ,")
+        return _join(clean if parts is None else rng.choice(parts) for parts in slots)
+
+    def all(self, keyword: str | Keyword) -> Iterator[str]:
+        """Iterates over the keyword's sentences, some of them more than once.
+
+        Raises:
+            ValueError: the family is noise, whose sentences are no products of parts.
+        """
+        if self.family == "noise":
+            raise ValueError("the sentences of noise cannot be listed; draw them with sample")
+        keyword = Keyword.parse(keyword)
+        for slots in _patterns(self.family, keyword.name):
+            yield from map(_join, product(*(self._clean.all(keyword) if parts is None else parts for parts in slots)))
+
+
+def _join(parts: Iterable[str]) -> str:
+    return " ".join(filter(None, parts)).replace(" ,", ",").strip(" ,")
 
 
 @cache

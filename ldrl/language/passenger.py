@@ -4,39 +4,17 @@ from __future__ import annotations
 
 import random
 import string
-from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
-from importlib import resources
-from typing import Any
 
-import yaml
-
-from ldrl.language.glove import Glove, load_glove
+from ldrl.language.families import Families
 from ldrl.language.keywords import KEYWORDS, Keyword
 from ldrl.language.sentences import Sentences
+from ldrl.language.spoken import MEANINGFUL, loosely, spoken
+from ldrl.language.tokens import Tokenizer
 
-__all__ = ["MEANINGFUL", "Passenger", "training_words"]
+__all__ = ["Passenger"]
 
-MEANINGFUL = frozenset(
-    [
-        "left",
-        "right",
-        "straight",
-        "first",
-        "second",
-        "next",
-        "two",
-        "twice",
-        "times",
-        "both",
-        "another",
-        "again",
-        "more",
-        "couple",
-    ]
-)
-"""Words that say which way and how often: never left out or stammered, but they may be misspelt."""
 FREQUENT = 20_000
 """How many of the most frequent words can be put into a sentence at random."""
 LOOSE = 0.6
@@ -68,9 +46,11 @@ ORDINALS = ("first", "second")
 class Passenger:
     """Says keywords for training, each time in another way.
 
+    What a listener would read as a held-out sentence, or as one of the family ``ambiguity``, is never said, except
+    single words. The sentences of the other families are too many to know them all.
+
     Args:
-        glove: where random words come from; None for the package's.
-        max_words: what a listener hears out; the :class:`~ldrl.language.Tokenizer` keeps so many.
+        tokenizer: of who listens: random words come from its vocabulary, and no sentence is longer than it keeps.
 
     Examples:
         >>> Passenger().say("left", random.Random(6))
@@ -79,11 +59,11 @@ class Passenger:
         'let me check the map'
     """
 
-    def __init__(self, glove: Glove | None = None, max_words: int = 48) -> None:
-        self.max_words = max_words
+    def __init__(self, tokenizer: Tokenizer | None = None) -> None:
+        self.tokenizer = Tokenizer() if tokenizer is None else tokenizer
         self._sentences = Sentences("train")
         # GloVe's rows are sorted by frequency: what people say is among the first.
-        frequent = list((load_glove() if glove is None else glove).words)[:FREQUENT]
+        frequent = list(self.tokenizer.glove.words)[:FREQUENT]
         self._words = [word for word in frequent if word.isalpha() and word not in DECISIVE]
 
     def say(self, keyword: str | Keyword, rng: random.Random) -> str:
@@ -94,9 +74,15 @@ class Passenger:
             rng: the source of randomness; nothing else decides.
 
         Returns:
-            A sentence of 1 to ``max_words`` words.
+            A sentence of 1 to ``tokenizer.max_tokens`` words.
         """
         keyword = Keyword.parse(keyword)
+        while True:
+            sentence = self._say(keyword, rng)
+            if " ".join(self.tokenizer.read(sentence)) not in _unsaid():
+                return sentence
+
+    def _say(self, keyword: Keyword, rng: random.Random) -> str:
         plain = self._phrase(keyword, rng)
         words = plain.split()
         if rng.random() < CLEAN:
@@ -110,11 +96,11 @@ class Passenger:
             if happened:
                 words = change(words, rng)
         sentence = " ".join(words)
-        return sentence if 0 < len(sentence.split()) <= self.max_words else plain
+        return sentence if 0 < len(sentence.split()) <= self.tokenizer.max_tokens else plain
 
     def nonsense(self, rng: random.Random) -> str:
         """Talk that asks for nothing, or 1 to 12 known and unknown words at random."""
-        talk = rng.choice(_spoken()["slots"]["talk"])
+        talk = rng.choice(spoken()["slots"]["talk"])
         if len(talk.split()) > 2 and rng.random() < 0.3:
             return talk
         unknown = rng.random()
@@ -125,13 +111,13 @@ class Passenger:
         if rng.random() >= LOOSE:
             return self._sentences.sample(keyword, rng)
         parts = []
-        for slot in rng.choice(_loosely(keyword.name)):
+        for slot in rng.choice(loosely(keyword.name)):
             name, _, of_then = slot.strip("()").partition(":")
             if not slot.startswith("(") or rng.random() < OPTIONAL:
                 then = keyword.manoeuvres[-1].name.lower()
                 said = then if of_then else keyword.manoeuvres[0].name.lower()
                 words = {"dir": said, "then": then, "other": "right" if said == "left" else "left"}
-                parts.append(rng.choice(_spoken()["slots"][name]).format(**words))
+                parts.append(rng.choice(spoken()["slots"][name]).format(**words))
         return " ".join(parts)
 
     def _shorten(self, keyword: Keyword, words: list[str], rng: random.Random) -> list[str]:
@@ -147,7 +133,7 @@ class Passenger:
         counted = of.intersection(words) == of.intersection(own)
         rate = rng.uniform(0.3, 1)
         if said != meant or not counted or not set(words).isdisjoint(NEGATIONS):
-            spare = _spoken()["spare"] if said else ()
+            spare = spoken()["spare"] if said else ()
             return [word for word in words if word not in spare or rng.random() >= rate]
         # "Left and after that right" must not come to "left after right".
         return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
@@ -167,7 +153,7 @@ class Passenger:
 
     def _correct(self, words: list[str], rng: random.Random) -> list[str]:
         """Say something wrong first, and take it back: the last word counts."""
-        marker = rng.choice(_spoken()["slots"]["corrections"]).split()
+        marker = rng.choice(spoken()["slots"]["corrections"]).split()
         spots = [k for k, word in enumerate(words) if word in DIRECTIONS or word in ORDINALS]
         if not spots or rng.random() < 0.3:
             wrong = self._phrase(rng.choice(list(KEYWORDS.values())), rng).split()
@@ -180,7 +166,7 @@ class Passenger:
 
     def _repeat(self, keyword: Keyword, words: list[str], rng: random.Random) -> list[str]:
         """Say it again, in the same words, and perhaps what is not meant."""
-        again = words + rng.choice(_spoken()["slots"]["confirmations"]).split() + words
+        again = words + rng.choice(spoken()["slots"]["confirmations"]).split() + words
         if rng.random() < DENIED:
             another = rng.choice([other for other in KEYWORDS.values() if other != keyword])
             again += rng.choice(DENIALS).split() + self._phrase(another, rng).split()
@@ -191,16 +177,16 @@ class Passenger:
         for _ in range(rng.randint(1, 3)):
             spot = rng.randint(0, len(words))
             stammers = spot < len(words) and words[spot] not in MEANINGFUL and rng.random() < 0.3
-            said = [words[spot]] if stammers else rng.choice(_spoken()["slots"]["fillers"]).split()
+            said = [words[spot]] if stammers else rng.choice(spoken()["slots"]["fillers"]).split()
             words = words[:spot] + said + words[spot:]
         return words
 
     def _talk(self, words: list[str], rng: random.Random) -> list[str]:
         """Talk of other things before, after or between, with direction words in another sense."""
         for _ in range(rng.randint(1, 2)):
-            said = rng.choice(_spoken()["slots"]["talk"]).split()
+            said = rng.choice(spoken()["slots"]["talk"]).split()
             spot = rng.choice((0, 0, len(words), rng.randint(0, len(words))))
-            back = rng.choice(_spoken()["slots"]["fillers"]).split() if 0 < spot < len(words) else []
+            back = rng.choice(spoken()["slots"]["fillers"]).split() if 0 < spot < len(words) else []
             words = words[:spot] + said + back + words[spot:]
         return words
 
@@ -212,7 +198,7 @@ class Passenger:
         if crucial and rng.random() < 0.6:
             spots.append(rng.choice(crucial))
         for spot in dict.fromkeys(spots):
-            heard = _spoken()["slips"].get(words[spot])
+            heard = spoken()["slips"].get(words[spot])
             words[spot] = rng.choice(heard) if heard and rng.random() < 0.5 else _misspell(words[spot], rng)
         return words
 
@@ -233,30 +219,9 @@ def _misspell(word: str, rng: random.Random) -> str:
 
 
 @cache
-def _spoken() -> dict[str, Any]:
-    return yaml.safe_load((resources.files(__package__) / "spoken.yaml").read_text("utf-8"))
-
-
-@cache
-def _loosely(name: str) -> list[list[str]]:
-    """The slots of each way to put a keyword loosely."""
-    return [slots for group in _spoken()["groups"] if name in group["keywords"] for slots in group["sentences"]]
-
-
-@cache
-def training_words() -> tuple[str, ...]:
-    """All words of the commands to train on: those that say which way and how often, those of the templates, others.
-
-    Among each, the words that stand in the most parts of commands come first.
-    """
-    template = {part for name in KEYWORDS for part in Sentences("train").parts(name)}
-    used = {slot.strip("()").partition(":")[0] for name in KEYWORDS for slots in _loosely(name) for slot in slots}
-    loose = [
-        part.format(dir="", then="", other="")
-        for slot in used - {"before", "after"}
-        for part in _spoken()["slots"][slot]
-    ]
-    usual, others = (Counter(word for part in parts for word in part.split()) for parts in (template, loose))
-    known = usual + others
-    order = sorted(known, key=lambda word: (word not in MEANINGFUL, word not in usual, -known[word], word))
-    return tuple(order)
+def _unsaid() -> frozenset[str]:
+    """The sentences of tests, as far as all of them can be listed, as they are read."""
+    tests = (Sentences("heldout"), Families("ambiguity"))
+    read = Tokenizer().read
+    sentences = {" ".join(read(sentence)) for test in tests for name in KEYWORDS for sentence in test.all(name)}
+    return frozenset(sentence for sentence in sentences if " " in sentence)

@@ -13,7 +13,7 @@ from rapidfuzz import process
 from rapidfuzz.distance import OSA
 
 from ldrl.language.glove import SPECIAL_ROWS, Glove, load_glove
-from ldrl.language.passenger import training_words
+from ldrl.language.spoken import training_words
 
 __all__ = ["MAX_TOKENS", "PADDING", "UNKNOWN", "Tokenizer", "normalise"]
 
@@ -131,14 +131,19 @@ class Tokenizer:
         rows = [self._row(sentence) for sentence in sentences]
         return torch.tensor(rows, dtype=torch.int64).reshape(-1, self.max_tokens)
 
-    def _row(self, sentence: str) -> list[int]:
+    def read(self, sentence: str) -> list[str]:
+        """The words that a sentence is read as, whether they are known or not; at most ``max_tokens``."""
         vocabulary = self.glove.words
         said = normalise(sentence)[: self.max_tokens]
-        if not said:
-            raise ValueError(f"the instruction {sentence!r} has no word: say what to do, for example 'turn left'")
         rare = [vocabulary.get(word, RARE) >= RARE for word in said]
         read = [(_read_as(word) or (word,)) if odd else (word,) for word, odd in zip(said, rare, strict=True)]
-        words = [word for part in read for word in part][: self.max_tokens]
+        return [word for part in read for word in part][: self.max_tokens]
+
+    def _row(self, sentence: str) -> list[int]:
+        vocabulary = self.glove.words
+        words = self.read(sentence)
+        if not words:
+            raise ValueError(f"the instruction {sentence!r} has no word: say what to do, for example 'turn left'")
         ids = [PADDING] * self.max_tokens
         for position, word in enumerate(words):
             if word in vocabulary:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ldrl.language import PADDING, Tokenizer, WordEmbedding
-from ldrl.language.passenger import training_words
+from ldrl.language.spoken import training_words
 
 __all__ = ["ImageEncoder", "InstructionEncoder"]
 

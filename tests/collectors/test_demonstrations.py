@@ -115,5 +115,5 @@ def test_demonstrations_are_loaded_as_they_were_collected(town2, tmp_path):
     loaded = load_demonstrations(tmp_path / "town2")
     assert len(loaded) == 120
     assert (loaded.storage[:] == collected.storage[:]).all()
-    with pytest.raises(FileNotFoundError, match="no demonstrations in .*atlantis"):
+    with pytest.raises(FileNotFoundError, match=r"no demonstrations in .*atlantis"):
         load_demonstrations(tmp_path / "atlantis")

@@ -51,7 +51,8 @@ def trained():
 def said():
     files = read("families")
     assert files.keys() == set(FAMILIES)
-    # Noise has no parts: it garbles held-out sentences, of which test_sentences.py shows that they are new.
+    # Noise has no parts: it garbles held-out sentences, of which test_sentences.py shows that they are new. What it
+    # hears instead of a word is compared below.
     return filled(part for file in files.values() for slot in file.get("slots", {}).values() for part in slot)
 
 
@@ -59,6 +60,16 @@ def test_no_training_part_is_a_part_of_a_family(trained, said):
     """Only trained parts are shown, so that who changes them need not look at the blind test."""
     shared = {" ".join(words) for words in trained if len(words) > 1 and words in said}
     assert not shared, "training parts that a blind test says as well: take others"
+
+
+def test_no_word_is_misheard_as_in_training():
+    spoken = yaml.safe_load((resources.files("ldrl.language") / "spoken.yaml").read_text("utf-8"))
+    misheard = read("families")["noise"]["misheard"]
+    assert set(misheard) & set(spoken["slips"])
+    heard = {(word, " ".join(normalise(said))) for word, others in misheard.items() for said in others}
+    shared = {(word, said) for word, others in spoken["slips"].items() for said in others} & heard
+    assert not shared, "slips of the training that the blind test makes as well: take others"
+    assert not {(word, said) for word, said in heard if word == said}
 
 
 def test_no_long_training_part_stands_inside_a_family(trained, said):

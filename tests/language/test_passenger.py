@@ -8,8 +8,9 @@ from importlib import resources
 import pytest
 import yaml
 
-from ldrl.language import KEYWORDS, MEANINGFUL, Passenger, Sentences, load_glove, normalise
-from ldrl.language.passenger import DECISIVE, DENIALS, training_words
+from ldrl.language import KEYWORDS, MEANINGFUL, Families, Passenger, Sentences, load_glove, normalise
+from ldrl.language.passenger import DECISIVE, DENIALS
+from ldrl.language.spoken import training_words
 
 DIRECTIONS = {"left", "right", "straight"}
 
@@ -38,6 +39,7 @@ def only(monkeypatch, **shares):
     """Let nothing happen to a sentence but what is named."""
     for name in ("CLEAN", "SHORTENED", "CORRECTED", "FILLED", "TALKED", "REPEATED", "SLIPPED", "DISTURBED", "LOOSE"):
         monkeypatch.setattr(f"ldrl.language.passenger.{name}", shares.get(name, 0.0))
+    monkeypatch.setattr("ldrl.language.passenger._unsaid", frozenset)
 
 
 def inside(words, sentence):
@@ -53,6 +55,16 @@ def test_sentences_vary_and_fit(passenger, name):
     assert all(sentence and len(sentence.split()) <= 48 for sentence in sentences)
     assert sentences == said(passenger, name, 500)
     assert sentences != said(passenger, name, 500, seed=1)
+
+
+@pytest.mark.parametrize("name", KEYWORDS)
+def test_what_a_test_says_is_never_said_even_misspelt(passenger, monkeypatch, name):
+    read = passenger.tokenizer.read
+    tests = {" ".join(read(text)) for test in (Sentences("heldout"), Families("ambiguity")) for text in test.all(name)}
+    tests = {text for text in tests if " " in text}
+    assert tests.isdisjoint(" ".join(read(sentence)) for sentence in said(passenger, name, 2000))
+    monkeypatch.setattr("ldrl.language.passenger._unsaid", frozenset)
+    assert not tests.isdisjoint(" ".join(read(sentence)) for sentence in said(passenger, name, 20_000))
 
 
 def test_clean_sentences_are_those_of_the_templates(passenger, monkeypatch):
