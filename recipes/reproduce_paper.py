@@ -169,7 +169,7 @@ def run(cells: list[Cell], jobs: int) -> list[Cell]:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = max(1, cores // jobs)
-    hardware = f"{platform.machine()}, {cores} cores, {jobs} cells side by side with {threads} threads each"
+    hardware = f"{processor()}, {cores} cores, {jobs} cells side by side with {threads} threads each"
     waiting, running, done, failed = list(cells), [], set(), []
     bar = tqdm(total=len(cells), desc="cells", unit="cell")
     try:
@@ -198,6 +198,14 @@ def run(cells: list[Cell], jobs: int) -> list[Cell]:
         for each in running:
             each.process.wait()
     return failed
+
+
+def processor() -> str:
+    """What Linux calls the processor, elsewhere its architecture."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{platform.machine()} ({names[0]})" if names else platform.machine()
 
 
 def close(ended: Running, hardware: str) -> bool:

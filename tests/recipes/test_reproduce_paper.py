@@ -219,7 +219,7 @@ def test_the_page_has_a_place_for_every_cell():
     evaluated = {cell for cell, given in CONFIG["cells"].items() if given.get("episodes_per_keyword") != 0}
     shown = {
         cell
-        for rows in ("FULL", "MODELS", "EVERY", "MISLEADING", "LOOKS", "FAMILIES")
+        for rows in ("FULL", "MODELS", "EVERY", "MISLEADING", "POSSIBLE", "LOOKS", "FAMILIES")
         for cell in getattr(results_page, rows).values()
     }
     assert shown | {"gs-hih-unseen"} == evaluated
