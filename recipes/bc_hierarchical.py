@@ -56,6 +56,15 @@ from ldrl.towns import Town
 
 LOW_LEVEL = ("control", "end_of_subtask")
 STAGES = ("low_level", "language", "high_level")  # the first soon shows whether all settings fit
+COUNTS = (
+    "demonstration_frames",
+    "sentences",
+    *(f"{stage}_steps" for stage in (*STAGES, "drives")),
+    *(f"batch_{rows}" for rows in ("sentences", "slices", "sequences", "drives")),
+    "slice_length",
+    "drive_length",
+)
+"""Settings that are whole numbers above 0."""
 
 
 class Training:
@@ -65,6 +74,13 @@ class Training:
         self.cfg, self.agent, self.folder = cfg, agent, folder
         self.policy = agent.high_level if isinstance(agent, HierarchicalAgent) else agent.policy
         self.towns = [Town.load(name) for name in cfg.towns]
+        self.given: dict[str, Buffer] = {}
+        if cfg.start_from.demonstrations is not None:
+            for town in self.towns:
+                path = Path(cfg.start_from.demonstrations) / "demonstrations" / town.name
+                self.given[town.name] = load_demonstrations(path)
+                if (count := len(self.given[town.name])) != cfg.demonstration_frames:
+                    raise ValueError(f"demonstration_frames is {cfg.demonstration_frames}; {path} has {count}, set it")
         shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
         self.logger = CSVLogger("log", str(folder))
         self.history: dict[str, list[float]] = {}
@@ -75,13 +91,9 @@ class Training:
         """Towns, the demonstrations there, collected or an earlier run's, and seeds for what is drawn from them."""
         cfg, driven = self.cfg, []
         for k, town in enumerate(tqdm(self.towns, "demonstrations", unit="town")):
-            path = Path(cfg.start_from.demonstrations or self.folder) / "demonstrations" / town.name
-            if cfg.start_from.demonstrations is None:
+            if (demonstrations := self.given.get(town.name)) is None:
+                path = self.folder / "demonstrations" / town.name
                 demonstrations = collect_demonstrations(town, cfg.demonstration_frames, path=path, seed=cfg.seed)
-            else:
-                demonstrations = load_demonstrations(path)
-                if len(demonstrations) != cfg.demonstration_frames:
-                    raise ValueError(f"{path} has {len(demonstrations)} frames; set demonstration_frames to this")
             driven.append((town, demonstrations, 100 * cfg.seed + k))
         return driven
 
@@ -91,7 +103,8 @@ class Training:
         steps = self.cfg[f"{title}_steps"]
         optimizer = torch.optim.Adam(parameters)
         rate = self.cfg.learning_rate
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps, pct_start=0.1)
+        # A bit more than a tenth, which of ten batches would leave the schedule a phase of no length.
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps, pct_start=0.1001)
         history: dict[str, list[float]] = defaultdict(list)
         bar = tqdm(range(steps), desc=title.replace("_", " "), unit="batch")
         for step in bar:
@@ -204,7 +217,13 @@ def check(cfg: DictConfig) -> None:
             raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
         if not cfg[name] and name != "stages":
             raise ValueError(f"{name} is empty; give at least one, such as {name}=[town1]")
-    if not 0 <= cfg.misleading <= 1:
+    least = dict.fromkeys(COUNTS, 1) | {"seed": 0}
+    if cfg.episodes_per_keyword is not None:
+        least["episodes_per_keyword"] = 0
+    for name, bound in least.items():
+        if type(cfg[name]) is not int or cfg[name] < bound:
+            raise ValueError(f"{name} is {cfg[name]!r}; give a whole number of at least {bound}")
+    if not isinstance(cfg.misleading, int | float) or not 0 <= cfg.misleading <= 1:
         raise ValueError(f"misleading is {cfg.misleading}; give a share from 0 to 1")
     if cfg.sentences < cfg.batch_sentences:
         raise ValueError(f"sentences is {cfg.sentences}; give at least a batch of them, {cfg.batch_sentences}")
@@ -233,7 +252,9 @@ def write_report(training: Training, towns: dict[str, Town], copied: Sequence[st
         outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
     trained = [f"{stage}: {count:,} batches" for stage, count in batches.items()]
     if set(batches) - {"language"}:
-        trained.append(f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}")
+        collected = f", collected for {cfg.start_from.demonstrations}" if training.given else ""
+        frames = f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}"
+        trained.append(frames + collected)
     levels = {"low_level" if part.startswith(LOW_LEVEL) else "high_level" for part in copied}
     taken = [f"{level} from {cfg.start_from[level]}" for level in sorted(levels, reverse=True)]
     details = {
@@ -260,10 +281,10 @@ def write_report(training: Training, towns: dict[str, Town], copied: Sequence[st
 @hydra.main(config_path="config", config_name="bc_hierarchical", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Run all stages."""
-    torch.manual_seed(cfg.seed)
     folder = Path("runs") / str(cfg.name)
     try:
         check(cfg)
+        torch.manual_seed(cfg.seed)
         towns = {town.name: town for town in map(Town.load, cfg.test_towns)}
         config = AgentConfig(model=cfg.model, modality=cfg.modality, **OmegaConf.to_container(cfg.size))
         if cfg.misleading and not config.parts.hierarchical:
@@ -294,7 +315,7 @@ def main(cfg: DictConfig) -> None:
     try:
         for stage in stages:
             getattr(training, stage)()
-    except (OSError, ValueError) as error:  # none or too few demonstrations, or a batch that does not divide
+    except ValueError as error:  # too few demonstrations, or a batch that does not divide
         sys.exit(f"error: {error}")
     save_agent(agent, folder)
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}

@@ -64,8 +64,9 @@ def main(cfg: DictConfig) -> None:
     """Check everything, then drive."""
     try:
         for name in ("num_cars", "unseen_towns", "routes_per_keyword"):
-            if cfg[name] is not None and cfg[name] < 1:
-                raise ValueError(f"{name} is {cfg[name]}; give at least 1")
+            allowed = name == "routes_per_keyword" and cfg[name] is None
+            if not allowed and (type(cfg[name]) is not int or cfg[name] < 1):
+                raise ValueError(f"{name} is {cfg[name]!r}; give a whole number of at least 1")
         agent = load_agent(str(cfg.checkpoint), cfg.device)
         chosen = choose_episodes(cfg)
         first = next(chosen)
@@ -86,7 +87,8 @@ def main(cfg: DictConfig) -> None:
     paper = paper_success(agent.config, misleading=cfg.episodes == "misleading") if in_paper else {}
     print(f"{table(outcomes, paper)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
-        write_json(outcomes, str(cfg.out))
+        details = {name: str(cfg[name]) for name in ("checkpoint", "episodes", "appearance", "device")}
+        write_json(outcomes, str(cfg.out), details)
         print(f"Every episode's outcome is in {cfg.out}.")
 
 

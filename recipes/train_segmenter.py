@@ -165,12 +165,25 @@ def plot_views(segmenter: RoadSegmenter, views: list[View], path: Path) -> None:
     imsave(path, torch.cat(lines).cpu().numpy())
 
 
+def check(cfg: DictConfig) -> None:
+    """Raise a ValueError for settings of which nothing can be made."""
+    for name, bound in {"seed": 0, "first_town": 0, "towns": 1, "steps": 1, "batch": 1, "frames": 1}.items():
+        if type(cfg[name]) is not int or cfg[name] < bound:
+            raise ValueError(f"{name} is {cfg[name]!r}; give a whole number of at least {bound}")
+    if cfg.first_row not in range(88):
+        raise ValueError(f"first_row is {cfg.first_row!r}; give a row of the image, 0 to 87")
+    if len(cfg.input_size) != 2 or not all(type(value) is int and value > 0 for value in cfg.input_size):
+        raise ValueError(f"input_size is {cfg.input_size}; give rows and columns, such as [44,100]")
+
+
 @hydra.main(config_path="config", config_name="train_segmenter", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Run all stages."""
     folder = Path("runs") / str(cfg.name)
-    torch.manual_seed(cfg.seed)
     try:
+        check(cfg)
+        torch.manual_seed(cfg.seed)
+        image_format = ImageFormat(size=tuple(cfg.input_size), first_row=cfg.first_row)
         from transformers import MobileNetV2Config, MobileNetV2ForSemanticSegmentation
 
         settings = OmegaConf.to_container(cfg.network) | {"id2label": {0: "background", 1: "road"}}
@@ -179,7 +192,6 @@ def main(cfg: DictConfig) -> None:
     except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
     began = time.perf_counter()
-    image_format = ImageFormat(size=tuple(cfg.size), first_row=cfg.first_row)
     towns = (Town.load(f"random-{cfg.first_town + k}") for k in range(cfg.towns))
     views = [
         Views(town, "sample", 0.5, cfg.seed + k, cfg.device)

@@ -271,9 +271,10 @@ def test_broken_episode_files(trained, some, tmp_path, call, line, message):
         (["episodes=none.xodr"], "there is no map 'none.xodr'; give an OpenDRIVE file"),
         (["out=no/such/folder.json"], "cannot write 'no/such/folder.json'"),
         (["out=cut"], "cannot write 'cut'"),
-        (["num_cars=0"], "num_cars is 0; give at least 1"),
-        (["episodes=unseen", "unseen_towns=0"], "unseen_towns is 0; give at least 1"),
-        (["routes_per_keyword=0"], "routes_per_keyword is 0; give at least 1"),
+        (["num_cars=0"], "num_cars is 0; give a whole number of at least 1"),
+        (["episodes=unseen", "unseen_towns=0"], "unseen_towns is 0; give a whole number of at least 1"),
+        (["routes_per_keyword=0"], "routes_per_keyword is 0; give a whole number of at least 1"),
+        (["num_cars=some"], "num_cars is 'some'; give a whole number of at least 1"),
         (["appearance=hail"], "weather 'hail' is unknown; use one of clear"),
         (["device=moon"], "moon"),
     ],
@@ -312,6 +313,12 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
         (["model=single", "stages=[low_level]"], "nothing of model single is trained, and nothing is taken"),
         (["stages=[]"], "nothing of model hih is trained, and nothing is taken from a trained agent"),
         (["misleading=25"], "misleading is 25; give a share from 0 to 1"),
+        (["misleading=some"], "misleading is some; give a share from 0 to 1"),
+        (["high_level_steps=0"], "high_level_steps is 0; give a whole number of at least 1"),
+        (["sentences=many"], "sentences is 'many'; give a whole number of at least 1"),
+        (["episodes_per_keyword=-1"], "episodes_per_keyword is -1; give a whole number of at least 0"),
+        (["seed=0.5"], "seed is 0.5; give a whole number of at least 0"),
+        (["start_from.demonstrations=atlantis"], "no demonstrations in 'atlantis/demonstrations/town1'; give a folder"),
         (["model=single", "misleading=0.25"], "misleading is 0.25 for model single, which cannot stop; set it to 0"),
         (["start_from.low_level=atlantis"], "no checkpoint 'atlantis'"),
         (["modality=rgb", "appearance=hail"], "weather 'hail' is unknown; use one of clear"),
@@ -466,7 +473,7 @@ def leaves(values):
     return (key for key in values if key not in ("defaults", "hydra"))
 
 
-@pytest.mark.parametrize("recipe", ["bc_hierarchical", "evaluate"])
+@pytest.mark.parametrize("recipe", ["bc_hierarchical", "evaluate", "reproduce_paper", "train_segmenter"])
 def test_every_config_key_is_read(recipe):
     files = [RECIPES / "config" / f"{recipe}.yaml"]
     if recipe == "bc_hierarchical":

@@ -63,6 +63,24 @@ def test_trains_on_random_towns_and_measures_the_built_in_ones(call, tmp_path):
     assert any(not torch.equal(weights[key], other[key]) for key in weights)
 
 
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("frames=0", "frames is 0; give a whole number of at least 1"),
+        ("first_town=abc", "first_town is 'abc'; give a whole number of at least 0"),
+        ("first_row=88", "first_row is 88; give a row of the image, 0 to 87"),
+        ("input_size=[44]", "input_size is [44]; give rows and columns, such as [44,100]"),
+        ("device=moon", "moon"),
+    ],
+)
+def test_bad_arguments(call, tmp_path, argument, message):
+    _, error, asked = call(*BRIEF, argument)
+    assert str(error).startswith("error: ")
+    assert message in error
+    assert not asked
+    assert not list(tmp_path.iterdir())
+
+
 def test_without_transformers(call, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     _, error, asked = call(*BRIEF)
