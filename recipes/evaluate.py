@@ -72,12 +72,12 @@ def main(cfg: DictConfig) -> None:
         first = next(chosen)
         if not first[1]:
             raise ValueError(f"no keyword can be realised in {cfg.episodes}; give a map with junctions")
-        make_camera(next(iter(first[0].values())), agent.modality, appearance=cfg.appearance)
+        make_camera(next(iter(first[0].values())), agent.modality, appearance=cfg.appearance, segmenter=cfg.segmenter)
         if cfg.out is not None:
             check_writable(str(cfg.out))
     except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
-    settings = {"num_cars": cfg.num_cars, "appearance": cfg.appearance, "device": cfg.device}
+    settings = {name: cfg[name] for name in ("num_cars", "appearance", "segmenter", "device")}
     outcomes = []
     with tqdm(desc="evaluation", unit="episode", total=0) as bar:
         for towns, episodes in chain([first], chosen):
@@ -87,7 +87,7 @@ def main(cfg: DictConfig) -> None:
     paper = paper_success(agent.config, misleading=cfg.episodes == "misleading") if in_paper else {}
     print(f"{table(outcomes, paper)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
-        details = {name: str(cfg[name]) for name in ("checkpoint", "episodes", "appearance", "device")}
+        details = {name: str(cfg[name]) for name in ("checkpoint", "episodes", "appearance", "segmenter", "device")}
         write_json(outcomes, str(cfg.out), details)
         print(f"Every episode's outcome is in {cfg.out}.")
 

@@ -99,8 +99,9 @@ def collect_demonstrations(
     if frames < num_cars or frames % num_cars:
         raise ValueError(f"{frames} frames do not divide among {num_cars} cars; use a positive multiple")
     steps = frames // num_cars
-    env = TransformedEnv(TownEnv(town, num_cars, max_steps=steps, seed=seed), SubtaskLabels(town))
-    policy = TensorDictSequential(Expert(town), SteeringNoise(noise, seed=seed))
+    drive = TownEnv(town, num_cars, max_steps=steps, seed=seed)
+    env = TransformedEnv(drive, SubtaskLabels(drive.town))
+    policy = TensorDictSequential(Expert(drive.town), SteeringNoise(noise, seed=seed))
     folder = None if path is None else str(path)
     buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(frames, scratch_dir=folder, existsok=True))
     collector = Collector(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
@@ -77,6 +78,7 @@ def evaluate(
     *,
     num_cars: int = 64,
     appearance: str | int = "clear",
+    segmenter: str | Path = "road-segmenter",
     device: torch.device | str = "cpu",
     progress: Callable[[int], object] | None = None,
 ) -> list[Outcome]:
@@ -88,8 +90,10 @@ def evaluate(
         episodes: of any towns.
         towns: by name, all that the episodes name.
         num_cars: episodes driven side by side.
-        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
-        device: where to drive.
+        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`. That of
+            ``"episode"`` depends on the row and on ``num_cars``.
+        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
+        device: where to drive; an agent must be there, too.
         progress: called with the number of episodes done after each batch of them.
 
     Returns:
@@ -106,14 +110,16 @@ def evaluate(
         rows = [i for i, episode in enumerate(episodes) if episode.town == name]
         # Episodes of like length together: a batch drives until its last car is done.
         rows.sort(key=lambda i: len(episodes[i].path))
-        actor = policy if isinstance(policy, TensorDictModuleBase) else policy(town)
+        there = town.on(device)
+        actor = policy if isinstance(policy, TensorDictModuleBase) else policy(there)
         for start in range(0, len(rows), num_cars):
             batch = rows[start : start + num_cars]
             env = make_env(
-                town,
+                there,
                 episodes=[episodes[i] for i in batch],
                 policy=actor,
                 appearance=appearance,
+                segmenter=segmenter,
                 device=device,
                 seed=start,
             )

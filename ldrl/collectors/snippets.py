@@ -212,7 +212,9 @@ class DisturbedView(Transform):
     """
 
     def __init__(self, town: Town, slice_length: int, *, lateral: float = 0.4, yaw: float = 0.1, seed: int = 0) -> None:
-        super().__init__(in_keys=[keys.POSE], out_keys=[keys.POSE, keys.ACTION])
+        super().__init__(
+            in_keys=[keys.POSE, keys.SPEED, keys.ROUTE, keys.ROUTE_POSITION], out_keys=[keys.POSE, keys.ACTION]
+        )
         self.town = town
         self.slice_length = slice_length
         self.lateral = lateral

@@ -114,8 +114,11 @@ def builtin_episodes(
     """
     rng = random.Random(f"{town.name}-{seed}")
     heldout = Sentences("heldout")
-    train = Sentences("train") if split == "train" else None
-    family = None if split in ("heldout", "train") else Families(split)
+    train, family = None, None
+    if split == "train":
+        train = Sentences("train")
+    elif split != "heldout":
+        family = Families(split)
     others_rng = random.Random(f"{town.name}-{seed}-{split}")
     episodes = []
     for keyword in KEYWORDS.values():

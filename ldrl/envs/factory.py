@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -25,14 +26,22 @@ __all__ = ["Modality", "make_camera", "make_env", "make_highway_env"]
 Modality = Literal["gs", "ps", "rgb"]
 
 
-def make_camera(town: Town, modality: Modality = "gs", *, appearance: str | int = "clear", seed: int = 0) -> Transform:
+def make_camera(
+    town: Town,
+    modality: Modality = "gs",
+    *,
+    appearance: str | int = "clear",
+    segmenter: str | Path = "road-segmenter",
+    seed: int = 0,
+) -> Transform:
     """What draws the images of a modality, in an env or in a replay buffer.
 
     Args:
         town: what there is to see.
-        modality: ``"gs"``, the road; ``"rgb"``; or ``"ps"``, the road that the shipped
-            :class:`~ldrl.envs.RoadSegmenter` sees in the rgb images.
+        modality: ``"gs"``, the road; ``"rgb"``; or ``"ps"``, the road that a :class:`~ldrl.envs.RoadSegmenter` sees in
+            the rgb images.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
+        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
         seed: of the appearances.
 
     Examples:
@@ -42,7 +51,7 @@ def make_camera(town: Town, modality: Modality = "gs", *, appearance: str | int 
         torch.Size([5, 1, 88, 200])
     """
     if modality == "ps":
-        return Compose(DashCamera(town, modality="rgb", appearance=appearance, seed=seed), RoadSegmenter())
+        return Compose(DashCamera(town, modality="rgb", appearance=appearance, seed=seed), RoadSegmenter(segmenter))
     return DashCamera(town, modality=modality, appearance=appearance, seed=seed)
 
 
@@ -54,6 +63,7 @@ def make_env(
     policy: TensorDictModuleBase | None = None,
     modality: Modality | None = None,
     appearance: str | int = "clear",
+    segmenter: str | Path = "road-segmenter",
     max_steps: int = 1000,
     traffic: int = 0,
     device: torch.device | str = "cpu",
@@ -68,10 +78,12 @@ def make_env(
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         modality: of the images, see :func:`make_camera`; None for what the policy is made for, or ``"gs"``.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
+        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
         max_steps: length of a roaming episode.
         traffic: other cars in each world.
         device: where the tensors are.
-        seed: of the env, the instructions and the appearances.
+        seed: of the env, the instructions and the appearances; ``env.set_seed`` reaches only the first, so parallel
+            workers need one each.
 
     Examples:
         >>> sorted(make_env("town1", num_cars=2).reset().keys())
@@ -79,7 +91,9 @@ def make_env(
     """
     town = town if isinstance(town, Town) else Town.load(town)
     env = TownEnv(town, num_cars, episodes=episodes, max_steps=max_steps, traffic=traffic, device=device, seed=seed)
-    return _stack(env, town, episodes, policy, modality, appearance, seed)
+    said = None if episodes is None else [episode.instruction for episode in episodes]
+    camera = partial(make_camera, env.town, appearance=appearance, segmenter=segmenter, seed=seed)
+    return _stack(env, env.town, Instruction(said, seed=seed), policy, modality, camera)
 
 
 def make_highway_env(
@@ -89,6 +103,7 @@ def make_highway_env(
     policy: TensorDictModuleBase | None = None,
     modality: Modality | None = None,
     appearance: str | int = "clear",
+    segmenter: str | Path = "road-segmenter",
     config: dict | None = None,
     seed: int = 0,
 ) -> TransformedEnv:
@@ -100,8 +115,10 @@ def make_highway_env(
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         modality: of the images, see :func:`make_camera`; None for what the policy is made for, or ``"gs"``.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
+        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
         config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
-        seed: of the env, the instructions and the appearances.
+        seed: of the env, the instructions and the appearances; ``env.set_seed`` reaches only the first, so parallel
+            workers need one each.
 
     Examples:
         >>> make_highway_env("town1", config={"vehicles_count": 3}).reset()["world", "traffic"].shape
@@ -110,23 +127,22 @@ def make_highway_env(
     town = town if isinstance(town, Town) else Town.load(town)
     env = GymWrapper(HighwayTownEnv((config or {}) | {"town": town, "episode": episode}))
     env.set_seed(seed)
-    return _stack(env, town, None if episode is None else [episode], policy, modality, appearance, seed)
+    said = None if episode is None else [episode.instruction]
+    camera = partial(make_camera, town, appearance=appearance, segmenter=segmenter, seed=seed)
+    return _stack(env, town, Instruction(said, seed=seed), policy, modality, camera)
 
 
 def _stack(
     env: EnvBase,
     town: Town,
-    episodes: Sequence[Episode] | None,
+    instruction: Instruction,
     policy: TensorDictModuleBase | None,
     modality: Modality | None,
-    appearance: str | int,
-    seed: int,
+    camera: Callable[[Modality], Transform],
 ) -> TransformedEnv:
-    said = None if episodes is None else [episode.instruction for episode in episodes]
-    transforms = [SubtaskLabels(town), Instruction(said, seed=seed)]
+    transforms = [SubtaskLabels(town), instruction]
     if policy is None or keys.IMAGE in policy.in_keys:
-        shown: Any = getattr(policy, "modality", "gs") if modality is None else modality
-        transforms.append(make_camera(town, shown, appearance=appearance, seed=seed).to(env.device))
+        transforms.append(camera(getattr(policy, "modality", "gs") if modality is None else modality))
     if policy is not None and hasattr(policy, "make_tensordict_primer"):
         transforms += [InitTracker(), policy.make_tensordict_primer()]
     return TransformedEnv(env, Compose(*transforms))

@@ -24,9 +24,8 @@ class Instruction(Transform):
         sentences: one sentence per car, said again at each of its resets; None draws a keyword and a sentence.
         keywords: what to draw from; None for all 14.
         split: which sentences are drawn, ``"train"`` or ``"heldout"``.
-        tokenizer: writes the tokens; None for one of 48 words.
         text: whether to write the sentence as ``language_instruction`` as well, which is slow.
-        seed: of the transform's own generator.
+        seed: of the transform's own generator; parallel workers need one each, for ``env.set_seed`` does not reach it.
 
     Raises:
         ValueError: an unknown keyword; at reset, a sentence without words or not one sentence per car.
@@ -46,12 +45,11 @@ class Instruction(Transform):
         *,
         keywords: Sequence[str] | None = None,
         split: Literal["train", "heldout"] = "train",
-        tokenizer: Tokenizer | None = None,
         text: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[keys.INSTRUCTION_TOKENS] + [keys.INSTRUCTION] * text)
-        self.tokenizer = Tokenizer() if tokenizer is None else tokenizer
+        self.tokenizer = Tokenizer()
         self.keywords = [Keyword.parse(name) for name in (keywords or KEYWORDS)]
         self.fixed = None if sentences is None else list(sentences)
         self.text = text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -63,7 +63,7 @@ class TownEnv(EnvBase):
             takes at 20 km/h, and 15 s; with traffic twice that.
         traffic: other cars in each world: how many, or where they come from.
         device: where the tensors are.
-        seed: of the env's own generator.
+        seed: of the env's own generator; parallel workers need one each, as by ``ParallelEnv.set_seed``.
 
     Raises:
         ValueError: no cars, an episode of another town, one whose start or path is off the road, or more traffic than
@@ -84,7 +84,7 @@ class TownEnv(EnvBase):
         max_steps: int = 1000,
         traffic: int | Traffic = 0,
         device: torch.device | str = "cpu",
-        seed: int | None = None,
+        seed: int = 0,
     ) -> None:
         if episodes is not None:
             if num_cars not in (None, len(episodes)):
@@ -93,7 +93,7 @@ class TownEnv(EnvBase):
         if not num_cars or num_cars < 1:
             raise ValueError(f"num_cars={num_cars}: give at least one car, or a list of episodes")
         super().__init__(device=torch.device(device), batch_size=[num_cars])
-        self.town = town.to(self.device)
+        self.town = town.on(self.device)
         self.episodes = episodes
         self._generator = torch.Generator(self.device)
         self.set_seed(seed)
@@ -162,6 +162,17 @@ class TownEnv(EnvBase):
         self._stop = torch.tensor([episode.stop for episode in episodes], device=self.device)
         seconds = [1.5 * route.length / vehicle.CRUISE_SPEED + PATIENCE for route in routes]
         self._limit = torch.tensor([math.ceil(s / vehicle.TIME_STEP) for s in seconds], device=self.device)
+
+    def to(self, *args: Any, **kwargs: Any) -> TownEnv:
+        """Nothing but to where it is: its state and its generator stay.
+
+        Raises:
+            ValueError: that is another device.
+        """
+        device = torch.empty(0, device=self.device).to(*args, **kwargs).device
+        if device != self.device:
+            raise ValueError(f"the env is on {self.device}; make it with device={str(device)!r} instead")
+        return super().to(*args, **kwargs)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

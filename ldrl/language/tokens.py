@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import torch
 from rapidfuzz import process
@@ -67,10 +67,26 @@ def _is_symbol(character: str) -> bool:
     return not character.isascii() and unicodedata.category(character) in ("So", "Sm", "Sc")
 
 
+@cache
+def _known() -> frozenset[str]:
+    return frozenset(training_words())
+
+
+def _join(words: list[str]) -> list[str]:
+    """Puts words of commands together that are written apart, "sec ond", unless both parts are such words, too."""
+    known, joined = _known(), words[:1]
+    for word in words[1:]:
+        if joined[-1] + word in known and not known.issuperset((joined[-1], word)):
+            joined[-1] += word
+        else:
+            joined.append(word)
+    return joined
+
+
 @lru_cache(maxsize=2**16)
 def _read_as(word: str) -> tuple[str, ...]:
     """The words of commands that a misspelt or run-together word stands for; none where it resembles nothing."""
-    known = training_words()
+    known = _known()
     if len(word) > LONGEST:
         return ()
     for parts in ((word[:k], word[k:]) for k in range(1, len(word))):
@@ -78,7 +94,7 @@ def _read_as(word: str) -> tuple[str, ...]:
             return parts
     if len(word) < min(EDITS):
         return ()
-    near = process.extractOne(word, known, scorer=OSA.distance, score_cutoff=EDITS.get(len(word), 2))
+    near = process.extractOne(word, training_words(), scorer=OSA.distance, score_cutoff=EDITS.get(len(word), 2))
     return () if near is None else (near[0],)
 
 
@@ -87,9 +103,9 @@ class Tokenizer:
 
     Id 0 is padding, 1 an unknown word, and ``r + 2`` the word of row ``r`` in GloVe. A word that GloVe does not have
     or that is rare, and that differs by a letter or two from a word of the training sentences, is read as that one;
-    two such words run together are taken apart. A sentence longer than ``max_tokens`` keeps its first words; the
-    longest template sentence fits. Words that remain unknown are counted in ``unknown``, so that a run can say what
-    its passengers said in vain.
+    two such words run together are taken apart, and one that is written in two parts is put together. A sentence
+    longer than ``max_tokens`` keeps its first words; the longest template sentence fits. Words that remain unknown are
+    counted in ``unknown``, so that a run can say what its passengers said in vain.
 
     Args:
         max_tokens: length of a row.
@@ -102,6 +118,8 @@ class Tokenizer:
         >>> tokenizer = Tokenizer(max_tokens=4)
         >>> tokenizer(["Turn left!", "trun lefft", "turn zzyzzyx"]).tolist()
         [[892, 220, 0, 0], [892, 220, 0, 0], [892, 1, 0, 0]]
+        >>> tokenizer.read("turnleft at the sec ond street")
+        ['turn', 'left', 'at', 'the']
         >>> tokenizer.unknown
         Counter({'zzyzzyx': 1})
     """
@@ -134,7 +152,7 @@ class Tokenizer:
     def read(self, sentence: str) -> list[str]:
         """The words that a sentence is read as, whether they are known or not; at most ``max_tokens``."""
         vocabulary = self.glove.words
-        said = normalise(sentence)[: self.max_tokens]
+        said = _join(normalise(sentence))[: self.max_tokens]
         rare = [vocabulary.get(word, RARE) >= RARE for word in said]
         read = [(_read_as(word) or (word,)) if odd else (word,) for word, odd in zip(said, rare, strict=True)]
         return [word for part in read for word in part][: self.max_tokens]

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import TensorDictPrimer
+from torchrl.modules import set_recurrent_mode
 
 from ldrl import keys
 from ldrl.modules.config import AgentConfig
@@ -94,4 +95,5 @@ class Agent(TensorDictModuleBase):
         if tensordict.batch_dims != 1:
             flat = tensordict.select(*in_keys).reshape(-1)
             return tensordict.update(self(flat).reshape(tensordict.shape))
-        return tensordict.update(self._step(tensordict.select(*in_keys)))
+        with set_recurrent_mode(False):  # a step of each, also where a loss lets its networks run over time
+            return tensordict.update(self._step(tensordict.select(*in_keys)))

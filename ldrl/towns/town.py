@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import zlib
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,11 @@ class Town(nn.Module):
             known = ", ".join(LAYOUTS)
             raise ValueError(f"unknown town {name!r}; use one of {known}, random-<seed>, or the path of a .xodr file")
         return cls(name, load_layout(name).network())
+
+    def on(self, device: torch.device | str) -> Town:
+        """This town where it is on the device, else a copy that is; ``to`` moves it for all that use it."""
+        device = torch.empty(0, device=device).device  # "cuda" is some "cuda:0"
+        return self if self.points.device == device else deepcopy(self).to(device)
 
     def _buffer(self, name: str, value: Tensor | np.ndarray | list) -> None:
         self.register_buffer(name, torch.as_tensor(value), persistent=False)

@@ -402,3 +402,16 @@ def test_reset_of_no_row_changes_nothing(town2):
     env._reset(TensorDict({"_reset": torch.zeros(3, 1, dtype=torch.bool)}, [3]))
     assert torch.equal(env._state, state)
     assert td.batch_size == (3,)
+
+
+def test_an_env_stays_on_its_device(town2):
+    env = TownEnv(town2, num_cars=2)
+    assert env.to("cpu") is env
+    with pytest.raises(ValueError, match="the env is on cpu; make it with device='meta' instead"):
+        env.to("meta")
+
+
+def test_a_town_on_another_device_is_a_copy(square):
+    assert square.on("cpu") is square
+    assert square.on("meta").points.is_meta
+    assert not square.points.is_meta

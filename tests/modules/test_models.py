@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from torchrl.modules import set_recurrent_mode
 
 from ldrl import keys
 from ldrl.envs import make_env
@@ -97,6 +98,14 @@ def test_a_rows_actions_are_its_own(make, drive, model):
     torch.testing.assert_close(alone[keys.ACTION][0], together[keys.ACTION][2])
     assert (together[keys.ACTION].abs() <= 1).all()
     assert set(agent.out_keys) <= set(together.keys(True, True))
+
+
+@pytest.mark.parametrize("model", ["hih", "single"])
+def test_an_agent_takes_single_steps_in_recurrent_mode_too(make, drive, model):
+    agent = make(model)
+    with set_recurrent_mode(True):
+        there = drive(agent, 2, 3)
+    torch.testing.assert_close(there[keys.ACTION], drive(agent, 2, 3)[keys.ACTION])
 
 
 @pytest.mark.parametrize("model", MODELS)
