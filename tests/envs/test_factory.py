@@ -79,11 +79,6 @@ def test_a_policy_sees_what_it_is_made_for(town2, modality, channels):
 
 @pytest.mark.parametrize("modality", ["gs", "rgb"])
 @pytest.mark.parametrize("world", ["town", "highway"])
-def test_weights_of_the_segmenter_by_name(town2):
-    with pytest.raises(ValueError, match="atlantis"):
-        make_env(town2, 2, modality="ps", segmenter="atlantis/no-such-segmenter")
-
-
 def test_other_cars_are_in_the_picture(town2, world, modality):
     if world == "town":
         env = make_env(town2, 1, traffic=20, modality=modality, seed=1)
@@ -97,6 +92,11 @@ def test_other_cars_are_in_the_picture(town2, world, modality):
     assert differs.any()
     if modality == "gs":
         assert (images[keys.IMAGE] <= empty).all()  # cars only hide
+
+
+def test_weights_of_the_segmenter_by_name(town2):
+    with pytest.raises(ValueError, match="atlantis"):
+        make_env(town2, 2, modality="ps", segmenter="atlantis/no-such-segmenter")
 
 
 def test_appearance_per_episode(town2):
