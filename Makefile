@@ -24,7 +24,7 @@ train: setup ## collect, train and evaluate the default agent; results go to run
 	$(RUN) recipes/bc_hierarchical.py $(ARGS)
 
 test: setup ## run the tests and the doctests
-	$(RUN) -m pytest -n auto --maxprocesses 4 $(ARGS)
+	OMP_NUM_THREADS=1 $(RUN) -m pytest -n auto --maxprocesses 4 $(ARGS)
 
 lint: setup ## ruff check, ruff format --check, mypy
 	$(RUN) -m ruff check .

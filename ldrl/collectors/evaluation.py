@@ -140,7 +140,10 @@ def _drive(env: EnvBase, policy: TensorDictModuleBase, episodes: Sequence[Episod
     mask = [running]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while running.any():
-            tensordict = env.step(policy(tensordict.set("_step", running)))
+            # Only who still drives is asked; the others get what some car does, and stay where they are.
+            chosen = policy(tensordict[running]).select(*policy.out_keys)
+            tensordict.update(chosen[(running.cumsum(0) - 1).clamp(min=0)])
+            tensordict = env.step(tensordict.set("_step", running))
             # What was chosen belongs to the frame that it was chosen at.
             frames[-1].update(tensordict.select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
             frames.append(tensordict["next"].select(*RECORDED))
