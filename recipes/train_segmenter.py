@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 from tqdm import tqdm
 
+from ldrl.collectors.results_page import segmenter_table
 from ldrl.envs import DashCamera, RoadSegmenter
 from ldrl.envs.appearance import WEATHERS
 from ldrl.envs.camera import shift
@@ -138,20 +139,6 @@ def measure(cfg: DictConfig, segmenter: RoadSegmenter, towns: list[Town]) -> tup
     return rows, seen
 
 
-def table(rows: list[dict]) -> str:
-    """A Markdown table: a row per look, the towns side by side."""
-    towns = list(dict.fromkeys(row["town"] for row in rows))
-    found = {(row["town"], row["look"]): row for row in rows}
-    lines = [
-        f"| look | {' | '.join(f'{town} IoU | {town} worst view' for town in towns)} |",
-        "| --- |" + " ---: |" * 2 * len(towns),
-    ]
-    for look in dict.fromkeys(row["look"] for row in rows):
-        figures = (f"{found[town, look][key]:.3f}" for town in towns for key in ("iou", "worst_view"))
-        lines.append(f"| {look} | {' | '.join(figures)} |")
-    return "\n".join(lines)
-
-
 def plot_views(segmenter: RoadSegmenter, views: list[View], path: Path) -> None:
     """A line for each town and look, two views in each: what is seen, the road, the road found, where they differ."""
     lines = []
@@ -215,8 +202,8 @@ def main(cfg: DictConfig) -> None:
     report = {"details": details, "config": OmegaConf.to_container(cfg), "rows": rows}
     (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     listed = "\n".join(f"- {name}: {told}" for name, told in details.items())
-    (folder / "report.md").write_text(f"# {folder.name}\n\n{table(rows)}\n\n{listed}\n", encoding="utf-8")
-    print(f"\n{table(rows)}\nEverything is in {folder}/; start with report.md and views.png.")
+    (folder / "report.md").write_text(f"# {folder.name}\n\n{segmenter_table(rows)}\n\n{listed}\n", encoding="utf-8")
+    print(f"\n{segmenter_table(rows)}\nEverything is in {folder}/; start with report.md and views.png.")
 
 
 if __name__ == "__main__":

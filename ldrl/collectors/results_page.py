@@ -10,7 +10,7 @@ from ldrl.collectors.paper import LEAST_IOU, MOST_MINUTES, SUCCESS, TARGETS, Tar
 from ldrl.collectors.report import markdown_table
 from ldrl.collectors.results import FOUR_WAY, T_ONLY, Result, Results
 
-__all__ = ["results_page"]
+__all__ = ["results_page", "segmenter_table"]
 
 TOWNS = {"town1": "Town 1", "town2": "Town 2", "unseen": "unseen towns"}
 TYPES = ("single", "double", "ordinal", "all")
@@ -252,15 +252,23 @@ def _unseen(results: Results) -> str:
     )
 
 
-def _segmenter(report: Mapping[str, Any]) -> str:
-    rows = {(row["town"], row["look"]): row for row in report["rows"]}
-    looks = dict.fromkeys(look for _, look in rows)
+def segmenter_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What a road segmenter reaches in each look, both towns side by side, in Markdown.
+
+    Args:
+        rows: of the ``report.json`` that ``recipes/train_segmenter.py`` writes.
+    """
+    found = {(row["town"], row["look"]): row for row in rows}
     lines = [("look", *(f"{TOWNS[town]} {what}" for town in ("town1", "town2") for what in ("IoU", "worst view")))]
-    for look in looks:
-        both = (rows[town, look] for town in ("town1", "town2"))
+    for look in dict.fromkeys(look for _, look in found):
+        both = (found[town, look] for town in ("town1", "town2"))
         lines.append((look, *(f"{row[name]:.3f}" for row in both for name in ("iou", "worst_view"))))
+    return markdown_table(lines, left=1)
+
+
+def _segmenter(report: Mapping[str, Any]) -> str:
     trained = report["details"]["training"]
-    return f"Intersection over union of the road. Trained: {trained}.\n\n{markdown_table(lines, left=1)}"
+    return f"Intersection over union of the road. Trained: {trained}.\n\n{segmenter_table(report['rows'])}"
 
 
 def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:

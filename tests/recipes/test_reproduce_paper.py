@@ -16,7 +16,9 @@ from hydra.core.global_hydra import GlobalHydra
 from ldrl.collectors import results_page
 from ldrl.collectors.paper import SUCCESS, TARGETS
 from ldrl.collectors.results import Results
+from ldrl.envs.appearance import appearance_number
 from ldrl.modules import AgentConfig
+from ldrl.towns import Town
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 CONFIG = yaml.safe_load((RECIPES / "config" / "reproduce_paper.yaml").read_text())
@@ -213,6 +215,16 @@ def test_bad_arguments(reproduce, argument, message):
     made, error, _ = reproduce(argument)
     assert message in error
     assert made == []
+
+
+def test_one_look_is_town_1s_own():
+    number = appearance_number(Town.load("town1").scenery.seed, "clear")
+    assert CONFIG["cells"]["rgb-hih-clear"]["appearance"] == number
+
+
+def test_later_seeds_need_what_the_first_needs(reproduce):
+    reproduce("tables=[models]", "seeds=[0,1]")
+    assert reproduce("tables=[models]", "seeds=[1]")[0] == []
 
 
 def test_the_page_has_a_place_for_every_cell():
