@@ -134,7 +134,8 @@ class Training:
             transforms: list[Transform] = [DisturbedView(town, length, seed=seed, **disturbed)]
             transforms.append(DeviceCastTransform(cfg.device))
             if isinstance(sampler, SnippetSampler) or keys.IMAGE in self.policy.in_keys:
-                camera = make_camera(town, cfg.modality, appearance=cfg.appearance, seed=seed).to(cfg.device)
+                looks = {"appearance": cfg.appearance, "segmenter": cfg.segmenter}
+                camera = make_camera(town, cfg.modality, seed=seed, **looks).to(cfg.device)
                 transforms.append(camera if isinstance(sampler, SnippetSampler) else OncePerFrame(camera))
             shown = {"batch_size": frames, "transform": Compose(*transforms)}
             buffers.append(Buffer(storage=demonstrations.storage, sampler=sampler, **shown))
@@ -249,7 +250,8 @@ def write_report(training: Training, towns: dict[str, Town], copied: Sequence[st
     began = time.perf_counter()
     episodes = choose_episodes(cfg, towns)
     with tqdm(total=len(episodes), desc="evaluation", unit="episode") as bar:
-        outcomes = evaluate(agent, episodes, towns, device=cfg.device, progress=bar.update)
+        settings = {"segmenter": cfg.segmenter, "device": cfg.device}
+        outcomes = evaluate(agent, episodes, towns, progress=bar.update, **settings)
     trained = [f"{stage}: {count:,} batches" for stage, count in batches.items()]
     if set(batches) - {"language"}:
         collected = f", collected for {cfg.start_from.demonstrations}" if training.given else ""
@@ -304,7 +306,8 @@ def main(cfg: DictConfig) -> None:
                 f"stages is {cfg.stages}, so nothing of model {cfg.model} is trained, and nothing is taken from a "
                 "trained agent: add language and high_level, or set start_from"
             )
-        make_camera(next(iter(towns.values())), cfg.modality, appearance=cfg.appearance)
+        town = next(iter(towns.values()))
+        make_camera(town, cfg.modality, appearance=cfg.appearance, segmenter=cfg.segmenter)
         training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, folder / "config.yaml")

@@ -77,18 +77,18 @@ def main(cfg: DictConfig) -> None:
             check_writable(str(cfg.out))
     except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
-    settings = {name: cfg[name] for name in ("num_cars", "appearance", "segmenter", "device")}
+    settings = {"appearance": cfg.appearance, "segmenter": cfg.segmenter, "device": cfg.device}
     outcomes = []
     with tqdm(desc="evaluation", unit="episode", total=0) as bar:
         for towns, episodes in chain([first], chosen):
             bar.total += len(episodes)
-            outcomes += evaluate(agent, episodes, towns, progress=bar.update, **settings)
+            outcomes += evaluate(agent, episodes, towns, num_cars=cfg.num_cars, progress=bar.update, **settings)
     in_paper = cfg.episodes in ("builtin", "misleading")
     paper = paper_success(agent.config, misleading=cfg.episodes == "misleading") if in_paper else {}
     print(f"{table(outcomes, paper)}\n\n{keyword_table(outcomes)}")
     if cfg.out is not None:
-        details = {name: str(cfg[name]) for name in ("checkpoint", "episodes", "appearance", "segmenter", "device")}
-        write_json(outcomes, str(cfg.out), details)
+        details = {"checkpoint": cfg.checkpoint, "episodes": cfg.episodes} | settings
+        write_json(outcomes, str(cfg.out), {name: str(value) for name, value in details.items()})
         print(f"Every episode's outcome is in {cfg.out}.")
 
 

@@ -323,6 +323,7 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
         (["start_from.low_level=atlantis"], "no checkpoint 'atlantis'"),
         (["modality=rgb", "appearance=hail"], "weather 'hail' is unknown; use one of clear"),
         (["test_towns=[town2,atlantis]"], "'atlantis'"),
+        (["modality=ps", "segmenter=."], "segmenter"),
         (["size.features=0"], "features is 0; give a whole number above 0"),
         (["size.image_rows=10"], "rows is 10"),
         (["device=moon"], "moon"),
