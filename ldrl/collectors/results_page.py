@@ -91,9 +91,9 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
     trained once, in 36 minutes that are not among those below, and serves all seeds.
 11. **Views beside the path** are labelled by asking the expert there, where the paper shifts the steering of turned
     cameras by a constant: recovery is learned exactly.
-12. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step: that
-    costs ten times as much and gave an early agent nothing. Single policies that see 10 frames do better than those
-    of Table 3 here, see [the design](design.md#what-the-baselines-lack).
+12. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step, which gave
+    an early agent nothing. But single policies that see 10 frames do better than those of Table 3 here, see
+    [the design](design.md#what-the-baselines-lack).
 13. **Misleading instructions** are a quarter of those in training, which starts from the agent that knows none; the
     paper says no share."""
 MODELS_NOTE = """\
