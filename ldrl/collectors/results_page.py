@@ -248,7 +248,8 @@ def _unseen(results: Results) -> str:
         lines.append((type_, f"{mean(episodes):.0f}" if episodes else "-", *map(_spread, rates)))
     table = markdown_table(lines, left=1)
     return (
-        f"Random towns from number 0 on, in which no agent was trained; two routes of every keyword in each.\n\n{table}"
+        "Random towns, number 0 to 49 unless the command says otherwise, in which no agent was trained; two routes of "
+        f"every keyword in each.\n\n{table}"
     )
 
 
