@@ -48,7 +48,7 @@ from ldrl.collectors import (
 )
 from ldrl.collectors.paper import paper_success
 from ldrl.collectors.plots import plot_losses, plot_tracks
-from ldrl.collectors.report import replacing, table, to_markdown, write_json
+from ldrl.collectors.report import check_whole_numbers, replacing, table, to_markdown, write_json
 from ldrl.envs import Episode, builtin_episodes, make_camera, misleading_episodes
 from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
@@ -221,9 +221,7 @@ def check(cfg: DictConfig) -> None:
     least = dict.fromkeys(COUNTS, 1) | {"seed": 0}
     if cfg.episodes_per_keyword is not None:
         least["episodes_per_keyword"] = 0
-    for name, bound in least.items():
-        if type(cfg[name]) is not int or cfg[name] < bound:
-            raise ValueError(f"{name} is {cfg[name]!r}; give a whole number of at least {bound}")
+    check_whole_numbers(cfg, least)
     if not isinstance(cfg.misleading, int | float) or not 0 <= cfg.misleading <= 1:
         raise ValueError(f"misleading is {cfg.misleading}; give a share from 0 to 1")
     if cfg.sentences < cfg.batch_sentences:

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from ldrl.collectors import evaluate
 from ldrl.collectors.paper import paper_success
-from ldrl.collectors.report import check_writable, keyword_table, table, write_json
+from ldrl.collectors.report import check_whole_numbers, check_writable, keyword_table, table, write_json
 from ldrl.envs import Episode, builtin_episodes, load_episodes, make_camera, misleading_episodes
 from ldrl.language import Family
 from ldrl.modules import load_agent
@@ -63,10 +63,9 @@ def choose_episodes(cfg: DictConfig) -> Iterator[tuple[dict[str, Town], list[Epi
 def main(cfg: DictConfig) -> None:
     """Check everything, then drive."""
     try:
-        for name in ("num_cars", "unseen_towns", "routes_per_keyword"):
-            allowed = name == "routes_per_keyword" and cfg[name] is None
-            if not allowed and (type(cfg[name]) is not int or cfg[name] < 1):
-                raise ValueError(f"{name} is {cfg[name]!r}; give a whole number of at least 1")
+        check_whole_numbers(cfg, {"num_cars": 1, "unseen_towns": 1})
+        if cfg.routes_per_keyword is not None:
+            check_whole_numbers(cfg, {"routes_per_keyword": 1})
         agent = load_agent(str(cfg.checkpoint), cfg.device)
         chosen = choose_episodes(cfg)
         first = next(chosen)

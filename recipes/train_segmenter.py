@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 from tqdm import tqdm
 
+from ldrl.collectors.report import check_whole_numbers
 from ldrl.collectors.results_page import segmenter_table
 from ldrl.envs import DashCamera, RoadSegmenter
 from ldrl.envs.appearance import WEATHERS
@@ -154,9 +155,7 @@ def plot_views(segmenter: RoadSegmenter, views: list[View], path: Path) -> None:
 
 def check(cfg: DictConfig) -> None:
     """Raise a ValueError for settings of which nothing can be made."""
-    for name, bound in {"seed": 0, "first_town": 0, "towns": 1, "steps": 1, "batch": 1, "frames": 1}.items():
-        if type(cfg[name]) is not int or cfg[name] < bound:
-            raise ValueError(f"{name} is {cfg[name]!r}; give a whole number of at least {bound}")
+    check_whole_numbers(cfg, {"seed": 0, "first_town": 0, "towns": 1, "steps": 1, "batch": 1, "frames": 1})
     if cfg.first_row not in range(88):
         raise ValueError(f"first_row is {cfg.first_row!r}; give a row of the image, 0 to 87")
     if len(cfg.input_size) != 2 or not all(type(value) is int and value > 0 for value in cfg.input_size):

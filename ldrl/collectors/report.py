@@ -137,6 +137,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
 
 
+def check_whole_numbers(settings: Mapping[str, Any], least: Mapping[str, int]) -> None:
+    """Raise a ValueError that names a setting which is no whole number, or below the least that it may be."""
+    for name, bound in least.items():
+        if type(settings[name]) is not int or settings[name] < bound:
+            raise ValueError(f"{name} is {settings[name]!r}; give a whole number of at least {bound}")
+
+
 def check_writable(path: str | Path) -> None:
     """Raise :func:`replacing`'s OSError now, before a long evaluation, if its file could not be written in the end."""
     with _temporary_beside(Path(path)):
