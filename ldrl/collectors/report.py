@@ -17,6 +17,7 @@ from ldrl.collectors.paper import Success
 from ldrl.language import KEYWORDS
 
 __all__ = [
+    "check_whole_numbers",
     "check_writable",
     "keyword_table",
     "markdown_table",
