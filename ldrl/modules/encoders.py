@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ldrl.language import PADDING, Tokenizer, WordEmbedding
+from ldrl.language.sound import Likeness
 from ldrl.language.spoken import training_words
 
 __all__ = ["ImageEncoder", "InstructionEncoder"]
@@ -118,11 +119,12 @@ class InstructionEncoder(nn.Module):
         # Saved with the weights: other training commands may have other usual words.
         self.register_buffer("usual_tokens", torch.tensor(sorted(tokens)))
         self.learned = nn.Embedding(usual + 1, learned, padding_idx=0)
+        self.likeness = Likeness()
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
         # Two instead of one that is bidirectional: on padded sequences, packed ones train four times as long on a CPU.
-        self.forward_gru = nn.GRU(50 + learned, hidden // 2, batch_first=True)
-        self.backward_gru = nn.GRU(50 + learned, hidden // 2, batch_first=True)
+        self.forward_gru = nn.GRU(50 + learned + self.likeness.out_features, hidden // 2, batch_first=True)
+        self.backward_gru = nn.GRU(50 + learned + self.likeness.out_features, hidden // 2, batch_first=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Encode instructions.
@@ -144,7 +146,7 @@ class InstructionEncoder(nn.Module):
         if self.training:
             vectors = self.dropout(vectors + self.noise * torch.randn_like(vectors))
             usual &= torch.rand(usual.shape, device=flat.device) >= self.dropout.p
-        vectors = torch.cat((vectors, self.learned((place + 1) * usual)), -1)
+        vectors = torch.cat((vectors, self.learned((place + 1) * usual), self.likeness(flat)), -1)
         from_end = (length.unsqueeze(-1) - 1 - torch.arange(longest, device=flat.device)).clamp(min=0).unsqueeze(-1)
         onward, _ = self.forward_gru(vectors)
         backward, _ = self.backward_gru(vectors.take_along_dim(from_end, 1))
