@@ -90,13 +90,15 @@ class InstructionEncoder(nn.Module):
     """Frozen GloVe vectors, with learned ones of usual words, through a single-layer GRU that reads both ways.
 
     GloVe holds left and right, or first and second, for nearly the same; so the words that training commands use most
-    have a second vector, which is learned. In training the vectors are disturbed and some of the learned ones left out,
-    so that words with like vectors come to count alike and a sentence is understood that was never trained on.
+    have a second vector, which is learned, and each word is known by what it looks and sounds like, too. In training
+    GloVe's vectors are disturbed and some of either kind left out, so that words with like vectors, looks or sounds come
+    to count alike and a sentence is understood that was never trained on.
 
     Args:
         hidden: size of a word's state, half of it of the GRU that reads backwards; an even number.
         noise: standard deviation of Gaussian noise on GloVe's vectors in training.
-        dropout: share of their components that is dropped in training, and of the words whose learned vector is.
+        dropout: share of their components that is dropped in training, of the words whose vector of GloVe's is, and of
+            those whose learned one is.
         usual: how many words have a learned vector; it is zero for all others.
         learned: size of the learned vectors.
 
@@ -145,7 +147,8 @@ class InstructionEncoder(nn.Module):
         usual = self.usual_tokens[place] == flat
         if self.training:
             vectors = self.dropout(vectors + self.noise * torch.randn_like(vectors))
-            usual &= torch.rand(usual.shape, device=flat.device) >= self.dropout.p
+            kept = torch.rand(2, *usual.shape, device=flat.device) >= self.dropout.p
+            usual, vectors = usual & kept[0], vectors * kept[1].unsqueeze(-1)
         vectors = torch.cat((vectors, self.learned((place + 1) * usual), self.likeness(flat)), -1)
         from_end = (length.unsqueeze(-1) - 1 - torch.arange(longest, device=flat.device)).clamp(min=0).unsqueeze(-1)
         onward, _ = self.forward_gru(vectors)
