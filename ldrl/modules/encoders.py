@@ -91,8 +91,8 @@ class InstructionEncoder(nn.Module):
 
     GloVe holds left and right, or first and second, for nearly the same; so the words that training commands use most
     have a second vector, which is learned, and each word is known by what it looks and sounds like, too. In training
-    GloVe's vectors are disturbed and some of either kind left out, so that words with like vectors, looks or sounds come
-    to count alike and a sentence is understood that was never trained on.
+    GloVe's vectors are disturbed and some of either kind left out, so that words that are alike, look or sound alike
+    come to count alike and a sentence is understood that was never trained on.
 
     Args:
         hidden: size of a word's state, half of it of the GRU that reads backwards; an even number.

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ldrl.language import Tokenizer, WordEmbedding
+from ldrl.language.sound import Likeness
 from ldrl.modules import ImageEncoder, InstructionEncoder
 
 LEARNED = {"learned", "forward_gru", "backward_gru"}
@@ -69,7 +70,7 @@ def test_words_against_the_plain_recurrence(encoder):
     states, is_word = encoder(tokens)
     assert states.shape == (3, 5, 6)
     for gru, half in ((encoder.forward_gru, slice(0, 3)), (encoder.backward_gru, slice(3, 6))):
-        cell = torch.nn.GRUCell(66, 3)
+        cell = torch.nn.GRUCell(66 + 28, 3)
         cell.load_state_dict({name.removesuffix("_l0"): value for name, value in gru.state_dict().items()})
         for row, length in enumerate((2, 5, 1)):
             state = torch.zeros(1, 3)
@@ -77,7 +78,7 @@ def test_words_against_the_plain_recurrence(encoder):
                 # Vectors that are learned: of usual words, and zeros for all others.
                 which = (encoder.usual_tokens == tokens[row, k]).nonzero().flatten()
                 learned = encoder.learned.weight[which[0] + 1] if len(which) else torch.zeros(16)
-                vector = torch.cat((WordEmbedding()(tokens[row, k]), learned))
+                vector = torch.cat((WordEmbedding()(tokens[row, k]), learned, Likeness()(tokens[row, k])))
                 state = cell(vector.unsqueeze(0), state)
                 torch.testing.assert_close(states[row, k, half], state[0])
     for row, length in enumerate((2, 5, 1)):
@@ -96,9 +97,13 @@ def test_usual_words_have_a_learned_vector(encoder):
     with torch.no_grad():
         encoder.learned.weight[1:] += 1
     assert not torch.equal(encoder(usual)[0], first)
-    # In training a share of them is left out; here all are, and GloVe's vectors with them.
+    # In training a share of them is left out; here all are, and GloVe's vectors with them, but never what looks alike.
     encoder.train()
-    assert torch.equal(encoder(usual)[0][0], encoder(usual)[0][-1])
+    states = encoder(usual)[0]
+    assert not torch.equal(states[0], states[-1])
+    encoder.likeness.forward = lambda tokens: torch.zeros(*tokens.shape, 28)
+    states = encoder(usual)[0]
+    assert torch.equal(states[0], states[-1])
 
 
 def test_padding_and_batch_do_not_matter(encoder):
