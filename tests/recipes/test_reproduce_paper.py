@@ -219,7 +219,7 @@ def test_bad_arguments(reproduce, argument, message):
 
 def test_one_look_is_town_1s_own():
     number = appearance_number(Town.load("town1").scenery.seed, "clear")
-    assert CONFIG["cells"]["rgb-hih-clear"]["appearance"] == number
+    assert [CONFIG["cells"][cell]["appearance"] for cell in ("rgb-low-clear", "rgb-hih-clear")] == [number, number]
 
 
 def test_later_seeds_need_what_the_first_needs(reproduce):
