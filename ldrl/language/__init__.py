@@ -5,6 +5,7 @@ from __future__ import annotations
 from ldrl.language.families import Families, Family
 from ldrl.language.glove import DIMENSIONS, Glove, WordEmbedding, load_glove
 from ldrl.language.keywords import KEYWORDS, SAFE_KEYWORDS, Keyword, realised_by
+from ldrl.language.likeness import Likeness
 from ldrl.language.passenger import Passenger
 from ldrl.language.sentences import Sentences, Split
 from ldrl.language.spoken import MEANINGFUL
@@ -22,6 +23,7 @@ __all__ = [
     "Family",
     "Glove",
     "Keyword",
+    "Likeness",
     "Passenger",
     "Sentences",
     "Split",

@@ -89,7 +89,8 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Agent:
         odd = sorted(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
         raise ValueError(
             f"{file} does not fit {folder / CONFIG}: {odd[0]} is {found.get(odd[0], 'missing')}, expected "
-            f"{expected.get(odd[0], 'absent')}; use the weights and the config of one training"
+            f"{expected.get(odd[0], 'absent')}; use the weights and the config of one training with "
+            "this version of ldrl"
         )
     agent.load_state_dict(weights)
     return agent.eval().to(device)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ldrl.language import PADDING, Tokenizer, WordEmbedding
-from ldrl.language.sound import Likeness
+from ldrl.language import DIMENSIONS, PADDING, Likeness, Tokenizer, WordEmbedding
 from ldrl.language.spoken import training_words
 
 __all__ = ["ImageEncoder", "InstructionEncoder"]
@@ -97,8 +96,8 @@ class InstructionEncoder(nn.Module):
     Args:
         hidden: size of a word's state, half of it of the GRU that reads backwards; an even number.
         noise: standard deviation of Gaussian noise on GloVe's vectors in training.
-        dropout: share of their components that is dropped in training, of the words whose vector of GloVe's is, and of
-            those whose learned one is.
+        dropout: probability in training that a component of a GloVe vector is left out, a word's whole GloVe vector, or
+            its learned one.
         usual: how many words have a learned vector; it is zero for all others.
         learned: size of the learned vectors.
 
@@ -125,8 +124,9 @@ class InstructionEncoder(nn.Module):
         self.noise = noise
         self.dropout = nn.Dropout(dropout)
         # Two instead of one that is bidirectional: on padded sequences, packed ones train four times as long on a CPU.
-        self.forward_gru = nn.GRU(50 + learned + self.likeness.out_features, hidden // 2, batch_first=True)
-        self.backward_gru = nn.GRU(50 + learned + self.likeness.out_features, hidden // 2, batch_first=True)
+        known = DIMENSIONS + learned + self.likeness.out_features
+        self.forward_gru = nn.GRU(known, hidden // 2, batch_first=True)
+        self.backward_gru = nn.GRU(known, hidden // 2, batch_first=True)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Encode instructions.

@@ -1,10 +1,11 @@
 """What words look and sound like."""
 
+import pickle
+
 import pytest
 import torch
 
-from ldrl.language import MEANINGFUL, PADDING, UNKNOWN, Tokenizer
-from ldrl.language.sound import Likeness
+from ldrl.language import MEANINGFUL, PADDING, UNKNOWN, Likeness, Tokenizer
 
 WORDS = sorted(MEANINGFUL)
 
@@ -40,3 +41,16 @@ def test_nothing_is_like_no_word():
     likeness = Likeness()
     assert likeness.out_features == 2 * len(WORDS)
     assert not likeness(torch.tensor([[PADDING, UNKNOWN]])).any()
+
+
+def test_it_is_unsaved_and_follows_its_input_to_a_device():
+    likeness = Likeness()
+    assert not likeness.state_dict()
+    assert len(pickle.dumps(likeness)) < 2000
+    assert likeness(torch.ones(2, 3, dtype=torch.int64, device="meta")).shape == (2, 3, likeness.out_features)
+
+
+def test_it_compiles_whole():
+    tokens, likeness = torch.tensor([[2, 0]]), Likeness()
+    compiled = torch.compile(likeness, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(tokens), likeness(tokens))
