@@ -7,11 +7,7 @@ import string
 from collections.abc import Callable
 from functools import cache, partial
 
-from torch import Tensor
-from torch.nn import functional
-
 from ldrl.language.families import Families
-from ldrl.language.glove import Glove
 from ldrl.language.keywords import KEYWORDS, Keyword
 from ldrl.language.sentences import Sentences
 from ldrl.language.spoken import MEANINGFUL, loosely, spoken
@@ -29,22 +25,20 @@ CLEAN = 0.2
 """Share of commands that are said without anything around them."""
 SHORTENED = 0.3
 """Share of the other commands that leave out what their meaning does not need."""
-CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, REWORDED, DISTURBED = 0.15, 0.3, 0.35, 0.15, 0.25, 0.3, 0.4
+CORRECTED, FILLED, TALKED, REPEATED, SLIPPED, DISTURBED = 0.15, 0.3, 0.35, 0.15, 0.25, 0.4
 """Shares of them with a self-correction, fillers, talk around them, a repetition, slips of the tongue, the typing hand
-or the speech recogniser, words that are like those meant, and words dropped, replaced or inserted at random."""
+or the speech recogniser, and words dropped, replaced or inserted at random."""
 DENIED = 0.3
 """Share of repetitions that go on with what is not meant."""
 RATE = 0.1
 """Probability that a word is dropped, replaced, or has another before it, in a sentence so disturbed."""
-REWORDED_RATE, NEIGHBOURS = 0.25, 8
-"""Probability that a word of a sentence so reworded becomes another, and how many can take its place."""
 DENIALS = ("not", "and not", "but not", "don t", "never", "rather than", "instead of")
 TURNING_ROUND = ("after", "before", "once")
 NEGATIONS = ("no", "not", "don", "never")
 DECISIVE = MEANINGFUL.union(
     TURNING_ROUND, NEGATIONS, ("skip", "pass", "past", "without", "neither", "opposite", "other")
 )
-"""Words that are not dropped, replaced, put for others or inserted: they would make another command of one."""
+"""Words that are not dropped, replaced or inserted at random: they would make another command of one."""
 DIRECTIONS = ("left", "right", "straight")
 ORDINALS = ("first", "second")
 
@@ -68,7 +62,9 @@ class Passenger:
     def __init__(self, tokenizer: Tokenizer | None = None) -> None:
         self.tokenizer = Tokenizer() if tokenizer is None else tokenizer
         self._sentences = Sentences("train")
-        self._words, _ = _frequent(self.tokenizer.glove)
+        # GloVe's rows are sorted by frequency: what people say is among the first.
+        frequent = list(self.tokenizer.glove.words)[:FREQUENT]
+        self._words = [word for word in frequent if word.isalpha() and word not in DECISIVE]
 
     def say(self, keyword: str | Keyword, rng: random.Random) -> str:
         """Say a keyword.
@@ -93,17 +89,11 @@ class Passenger:
             return plain
         if rng.random() < SHORTENED:
             words = self._shorten(keyword, words, rng)
-        changes: dict[Callable, float] = {
-            self._correct: CORRECTED,
-            self._reword: REWORDED,
-            self._disturb: DISTURBED,
-            partial(self._repeat, keyword): REPEATED,
-            self._fill: FILLED,
-            self._talk: TALKED,
-            self._slip: SLIPPED,
-        }
-        for change, share in changes.items():
-            if rng.random() < share:
+        happens = [rng.random() < share for share in (CORRECTED, DISTURBED, REPEATED, FILLED, TALKED, SLIPPED)]
+        repeat = partial(self._repeat, keyword)
+        changes: list[Callable] = [self._correct, self._disturb, repeat, self._fill, self._talk, self._slip]
+        for happened, change in zip(happens, changes, strict=True):
+            if happened:
                 words = change(words, rng)
         sentence = " ".join(words)
         return sentence if 0 < len(sentence.split()) <= self.tokenizer.max_tokens else plain
@@ -147,14 +137,6 @@ class Passenger:
             return [word for word in words if word not in spare or rng.random() >= rate]
         # "Left and after that right" must not come to "left after right".
         return [word for word in words if word in MEANINGFUL or (rng.random() >= rate and word not in TURNING_ROUND)]
-
-    def _reword(self, words: list[str], rng: random.Random) -> list[str]:
-        """Put words that GloVe holds for nearly the same for those that do not say which way or how often."""
-        glove = self.tokenizer.glove
-        return [
-            word if word in DECISIVE or rng.random() >= REWORDED_RATE else rng.choice(_neighbours(glove, word))
-            for word in words
-        ]
 
     def _disturb(self, words: list[str], rng: random.Random) -> list[str]:
         """Drop, replace and insert words that do not say which way or how often."""
@@ -234,24 +216,6 @@ def _misspell(word: str, rng: random.Random) -> str:
             word[:k] + word[k + 1 : k + 2] + word[k] + word[k + 2 :],
         )
     )
-
-
-@cache
-def _frequent(glove: Glove) -> tuple[list[str], Tensor]:
-    """Words that can be put into a sentence, and their vectors' directions, ``[words, 50]`` float32."""
-    # GloVe's rows are sorted by frequency: what people say is among the first.
-    words = [word for word in list(glove.words)[:FREQUENT] if word.isalpha() and word not in DECISIVE]
-    return words, functional.normalize(glove.vectors[[glove.words[word] for word in words]], dim=-1)
-
-
-@cache
-def _neighbours(glove: Glove, word: str) -> list[str]:
-    """The words whose vectors point nearest to this one's; itself if it has none."""
-    if word not in glove.words:
-        return [word]
-    words, directions = _frequent(glove)
-    nearest = (directions @ glove.vectors[glove.words[word]]).topk(NEIGHBOURS + 1).indices.tolist()
-    return [words[k] for k in nearest if words[k] != word][:NEIGHBOURS]
 
 
 @cache

@@ -7,7 +7,6 @@ from importlib import resources
 
 import pytest
 import yaml
-from torch.nn.functional import normalize
 
 from ldrl.language import KEYWORDS, MEANINGFUL, Families, Passenger, Sentences, load_glove, normalise
 from ldrl.language.passenger import DECISIVE, DENIALS
@@ -38,8 +37,7 @@ def said(passenger, name, count, seed=0):
 
 def only(monkeypatch, **shares):
     """Let nothing happen to a sentence but what is named."""
-    changes = ("CLEAN", "SHORTENED", "CORRECTED", "REWORDED", "DISTURBED", "REPEATED", "FILLED", "TALKED", "SLIPPED")
-    for name in (*changes, "LOOSE"):
+    for name in ("CLEAN", "SHORTENED", "CORRECTED", "FILLED", "TALKED", "REPEATED", "SLIPPED", "DISTURBED", "LOOSE"):
         monkeypatch.setattr(f"ldrl.language.passenger.{name}", shares.get(name, 0.0))
     monkeypatch.setattr("ldrl.language.passenger._unsaid", frozenset)
 
@@ -139,30 +137,6 @@ def test_what_says_which_way_survives_random_words(passenger, monkeypatch, name)
         assert decisive[0] == decisive[1]
         changed += sentence != plain
     assert 150 < changed < 300
-
-
-def test_rewording_takes_words_that_are_alike_for_those_that_do_not_decide(passenger, monkeypatch):
-    only(monkeypatch, REWORDED=1.0)
-    glove, rng = load_glove(), random.Random(3)
-    replaced, words = [], 0
-    for _ in range(100):
-        state = rng.getstate()
-        plain = passenger._phrase(KEYWORDS["second left"], rng).split()
-        rng.setstate(state)
-        pairs = list(zip(plain, passenger.say("second left", rng).split(), strict=True))
-        assert all(word == other for word, other in pairs if word in DECISIVE or other in DECISIVE)
-        replaced += [pair for pair in pairs if pair[0] != pair[1]]
-        words += sum(word not in DECISIVE for word in plain)
-    assert 0.2 < len(replaced) / words < 0.3
-    vectors = normalize(glove.vectors[[glove.words[word] for pair in replaced for word in pair]]).unflatten(0, (-1, 2))
-    assert vectors.prod(1).sum(-1).median() > 0.7
-
-
-def test_a_word_without_a_vector_is_not_reworded(passenger, monkeypatch):
-    monkeypatch.setattr("ldrl.language.passenger.REWORDED_RATE", 1.0)
-    words = ["zzyzzyx", "left", "corner"]
-    assert passenger._reword(words, random.Random(0))[:2] == words[:2]
-    assert passenger._reword(words, random.Random(0))[2] != "corner"
 
 
 @pytest.mark.parametrize("name", KEYWORDS)
