@@ -19,7 +19,7 @@ import shutil
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -50,11 +50,10 @@ from ldrl.collectors.paper import paper_success
 from ldrl.collectors.plots import plot_losses, plot_tracks
 from ldrl.collectors.report import check_whole_numbers, replacing, table, to_markdown, write_json
 from ldrl.envs import Episode, builtin_episodes, make_camera, misleading_episodes
-from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, load_agent, make_agent, save_agent
+from ldrl.modules import Agent, AgentConfig, HierarchicalAgent, copy_trained, make_agent, save_agent
 from ldrl.objectives import ControlLoss, EndOfSubtaskLoss, KeywordLoss, SinglePolicyLoss, SubtaskLoss
 from ldrl.towns import Town
 
-LOW_LEVEL = ("control", "end_of_subtask")
 STAGES = ("low_level", "language", "high_level")  # the first soon shows whether all settings fit
 COUNTS = (
     "demonstration_frames",
@@ -174,37 +173,6 @@ class Training:
         encoder.requires_grad_(True)
 
 
-def start_from(agent: Agent, earlier: Mapping[str, str | None]) -> list[str]:
-    """Copy the largest parts of trained agents that fit: same name, same tensors.
-
-    Args:
-        agent: what is to be trained.
-        earlier: checkpoints that ``low_level`` and ``high_level`` are taken from; what else is named is no part.
-
-    Returns:
-        The names of the parts.
-    """
-    # A single policy is made of the parts of a high-level policy.
-    own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
-    networks = {"low_level": LOW_LEVEL, "high_level": (own,)}
-    copied: list[str] = []
-    for level, parts in networks.items():
-        checkpoint = earlier[level]
-        if checkpoint is None:
-            continue
-        trained = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
-        for name, module in agent.named_modules():
-            if name.split(".")[0] not in parts or any(name.startswith(f"{part}.") for part in copied):
-                continue
-            theirs, shapes = trained.get(name), {key: value.shape for key, value in module.state_dict().items()}
-            if not shapes or type(theirs) is not type(module):
-                continue
-            if shapes == {key: value.shape for key, value in theirs.state_dict().items()}:
-                module.load_state_dict(theirs.state_dict())
-                copied.append(name)
-    return copied
-
-
 def reads(copied: Sequence[str]) -> bool:
     """Whether the encoder of instructions is in what was copied."""
     encoders = (f"{own}.module.0.module." for own in ("high_level", "policy"))
@@ -255,7 +223,7 @@ def write_report(training: Training, towns: dict[str, Town], copied: Sequence[st
         collected = f", collected for {cfg.start_from.demonstrations}" if training.given else ""
         frames = f"{cfg.demonstration_frames:,} frames of demonstrations in each of {', '.join(cfg.towns)}"
         trained.append(frames + collected)
-    levels = {"low_level" if part.startswith(LOW_LEVEL) else "high_level" for part in copied}
+    levels = {"high_level" if part.startswith(("high_level", "policy")) else "low_level" for part in copied}
     taken = [f"{level} from {cfg.start_from[level]}" for level in sorted(levels, reverse=True)]
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
@@ -290,7 +258,7 @@ def main(cfg: DictConfig) -> None:
         if cfg.misleading and not config.parts.hierarchical:
             raise ValueError(f"misleading is {cfg.misleading} for model {cfg.model}, which cannot stop; set it to 0")
         agent = make_agent(config).to(cfg.device)
-        copied = start_from(agent, cfg.start_from)
+        copied = copy_trained(agent, cfg.start_from.low_level, cfg.start_from.high_level)
         if cfg.start_from.low_level or cfg.start_from.high_level:
             print(f"Taken from trained agents: {', '.join(copied) or 'nothing, as nothing fits'}.")
         if "high_level" in cfg.stages and "language" not in cfg.stages and not reads(copied):

@@ -2,7 +2,7 @@
 
 from ldrl.modules.agent import Agent
 from ldrl.modules.attention import Concatenation, GatedAttention, LastWord, LuongAttention
-from ldrl.modules.checkpoint import PRETRAINED, load_agent, resolve_checkpoint, save_agent
+from ldrl.modules.checkpoint import PRETRAINED, copy_trained, load_agent, resolve_checkpoint, save_agent
 from ldrl.modules.config import MODELS, AgentConfig, Parts
 from ldrl.modules.controller import SwitchingController
 from ldrl.modules.encoders import ImageEncoder, InstructionEncoder
@@ -35,6 +35,7 @@ __all__ = [
     "SinglePolicy",
     "SubtaskGate",
     "SwitchingController",
+    "copy_trained",
     "load_agent",
     "make_agent",
     "resolve_checkpoint",

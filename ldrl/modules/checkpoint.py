@@ -18,9 +18,9 @@ from safetensors.torch import load_file, save_file
 
 from ldrl.modules.agent import Agent
 from ldrl.modules.config import AgentConfig
-from ldrl.modules.hierarchical import make_agent
+from ldrl.modules.hierarchical import HierarchicalAgent, make_agent
 
-__all__ = ["PRETRAINED", "load_agent", "resolve_checkpoint", "save_agent"]
+__all__ = ["PRETRAINED", "copy_trained", "load_agent", "resolve_checkpoint", "save_agent"]
 
 WEIGHTS = "agent.safetensors"
 CONFIG = "agent.json"
@@ -94,6 +94,38 @@ def load_agent(name: str | Path, device: torch.device | str = "cpu") -> Agent:
         )
     agent.load_state_dict(weights)
     return agent.eval().to(device)
+
+
+def copy_trained(agent: Agent, low_level: str | Path | None = None, high_level: str | Path | None = None) -> list[str]:
+    """Copy from trained agents the largest parts that fit: same name, same class, same tensors.
+
+    Args:
+        agent: what is to be trained; a single policy is made of the parts of a high-level policy.
+        low_level: the checkpoint that the networks of the low level are taken from.
+        high_level: that of the high level.
+
+    Returns:
+        The names of the parts.
+
+    Raises:
+        ValueError: as :func:`load_agent` does.
+    """
+    own = "high_level" if isinstance(agent, HierarchicalAgent) else "policy"
+    copied: list[str] = []
+    for checkpoint, networks in ((low_level, ("control", "end_of_subtask")), (high_level, (own,))):
+        if checkpoint is None:
+            continue
+        trained = {name.replace("high_level", own): module for name, module in load_agent(checkpoint).named_modules()}
+        for name, module in agent.named_modules():
+            if name.split(".")[0] not in networks or any(name.startswith(f"{part}.") for part in copied):
+                continue
+            theirs, shapes = trained.get(name), {key: value.shape for key, value in module.state_dict().items()}
+            if not shapes or theirs is None or type(theirs) is not type(module):
+                continue
+            if shapes == {key: value.shape for key, value in theirs.state_dict().items()}:
+                module.load_state_dict(theirs.state_dict())
+                copied.append(name)
+    return copied
 
 
 def _lender(folder: Path) -> Path:

@@ -7,7 +7,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from ldrl import keys
-from ldrl.modules import AgentConfig, HierarchicalAgent, checkpoint, load_agent, resolve_checkpoint, save_agent
+from ldrl.modules import (
+    AgentConfig,
+    HierarchicalAgent,
+    checkpoint,
+    copy_trained,
+    load_agent,
+    make_agent,
+    resolve_checkpoint,
+    save_agent,
+)
 
 WEIGHTS, CONFIG = "agent.safetensors", "agent.json"
 
@@ -162,3 +171,35 @@ def test_broken_configs(saved, content, message):
     (saved / CONFIG).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{CONFIG} {message}.*it is a JSON object with model, modality"):
         load_agent(saved)
+
+
+def test_levels_are_taken_from_the_checkpoints_named_for_them(tmp_path):
+    small = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "high_level_hidden": 7}
+    for name, model, modality in (("gs-h0", "h0", "gs"), ("rgb-hih", "hih", "rgb"), ("ps-hih", "hih", "ps")):
+        save_agent(make_agent(AgentConfig(model=model, modality=modality, **small)), tmp_path / name)
+    for modality in ("rgb", "ps"):
+        low, high = tmp_path / f"{modality}-hih", tmp_path / "gs-h0"
+        agent = make_agent(AgentConfig(model="h0", modality=modality, **small))
+        copied = copy_trained(agent, low, high)
+        assert sorted(copied) == ["control", "end_of_subtask", "high_level"]
+        for part, origin in (("control", low), ("end_of_subtask", low), ("high_level", high)):
+            theirs = getattr(load_agent(origin), part).state_dict()
+            ours = getattr(agent, part).state_dict()
+            assert all(ours[key].equal(value) for key, value in theirs.items())
+
+
+def test_of_a_network_that_does_not_fit_its_fitting_parts_are_taken(tmp_path):
+    small = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "high_level_hidden": 7}
+    trained = make_agent(AgentConfig(modality="gs", **small))
+    save_agent(trained, tmp_path / "gs-hih")
+    agent = make_agent(AgentConfig(model="single", modality="rgb", **small))
+    before = {key: value.clone() for key, value in agent.state_dict().items()}
+    copied = copy_trained(agent, high_level=str(tmp_path / "gs-hih"))
+    assert "policy" not in copied
+    theirs = {f"policy.{key}": value for key, value in trained.high_level.state_dict().items()}
+    for key, value in agent.state_dict().items():
+        taken = any(key.startswith(f"{part}.") for part in copied)
+        assert value.equal(theirs[key] if taken else before[key]), key
+    assert any(
+        key.startswith("policy.module.0.") and value.equal(theirs[key]) for key, value in agent.state_dict().items()
+    )

@@ -22,7 +22,7 @@ from torchrl.record import CSVLogger
 from ldrl.collectors import BoundarySampler
 from ldrl.envs import DashCamera, builtin_episodes, save_episodes
 from ldrl.language import KEYWORDS
-from ldrl.modules import AgentConfig, load_agent, make_agent, save_agent
+from ldrl.modules import AgentConfig, load_agent
 from ldrl.towns import Town
 
 MAP = Path(__file__).parents[1] / "towns" / "theta.xodr"
@@ -434,40 +434,6 @@ def test_unknown_presets_are_named(tmp_path, call):
     assert "preset/atlantis" in printed
     assert re.search(r"default\s+full\s+smoke", printed)
     assert not list(tmp_path.iterdir())
-
-
-def test_levels_are_taken_from_the_checkpoints_named_for_them(tmp_path):
-    start_from = runpy.run_path(str(RECIPES / "bc_hierarchical.py"), run_name="recipe")["start_from"]
-    small = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "high_level_hidden": 7}
-    for name, model, modality in (("gs-h0", "h0", "gs"), ("rgb-hih", "hih", "rgb"), ("ps-hih", "hih", "ps")):
-        save_agent(make_agent(AgentConfig(model=model, modality=modality, **small)), tmp_path / name)
-    for modality in ("rgb", "ps"):
-        low, high = tmp_path / f"{modality}-hih", tmp_path / "gs-h0"
-        agent = make_agent(AgentConfig(model="h0", modality=modality, **small))
-        copied = start_from(agent, {"low_level": str(low), "high_level": str(high)})
-        assert sorted(copied) == ["control", "end_of_subtask", "high_level"]
-        for part, checkpoint in (("control", low), ("end_of_subtask", low), ("high_level", high)):
-            theirs = getattr(load_agent(checkpoint), part).state_dict()
-            ours = getattr(agent, part).state_dict()
-            assert all(ours[key].equal(value) for key, value in theirs.items())
-
-
-def test_of_a_network_that_does_not_fit_its_fitting_parts_are_taken(tmp_path):
-    start_from = runpy.run_path(str(RECIPES / "bc_hierarchical.py"), run_name="recipe")["start_from"]
-    small = {"conv_channels": (2, 3, 4), "features": 8, "low_level_hidden": 6, "high_level_hidden": 7}
-    trained = make_agent(AgentConfig(modality="gs", **small))
-    save_agent(trained, tmp_path / "gs-hih")
-    agent = make_agent(AgentConfig(model="single", modality="rgb", **small))
-    before = {key: value.clone() for key, value in agent.state_dict().items()}
-    copied = start_from(agent, {"low_level": None, "high_level": str(tmp_path / "gs-hih")})
-    assert "policy" not in copied
-    theirs = {f"policy.{key}": value for key, value in trained.high_level.state_dict().items()}
-    for key, value in agent.state_dict().items():
-        taken = any(key.startswith(f"{part}.") for part in copied)
-        assert value.equal(theirs[key] if taken else before[key]), key
-    assert any(
-        key.startswith("policy.module.0.") and value.equal(theirs[key]) for key, value in agent.state_dict().items()
-    )
 
 
 def leaves(values):
