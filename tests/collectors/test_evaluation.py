@@ -46,7 +46,7 @@ def sample(episodes):
 @pytest.fixture(scope="module")
 def untrained():
     with torch.random.fork_rng():
-        torch.manual_seed(0)
+        torch.manual_seed(1)
         return HierarchicalAgent(AgentConfig(conv_channels=(2, 3, 4), features=8, low_level_hidden=6))
 
 

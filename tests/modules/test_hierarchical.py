@@ -65,7 +65,7 @@ def scripted(agent):
 @pytest.fixture
 def restless(agent):
     """An agent that votes for an end now and then, so that it switches often."""
-    agent.end_of_subtask.module[-1].bias.data += 0.3
+    agent.end_of_subtask.module[-1].bias.data += 0.7
     return agent
 
 
