@@ -108,7 +108,7 @@ doubles in Town 2 and Table 2 gives 0.986, which stands here. What the models th
 LOOKS_NOTE = """\
 The paper's agent falls in a town that looks otherwise, from 0.880 to 0.613. Ours hardly does by day, whatever it is
 trained on, as it starts from an agent on gs and sees colours relative to the road. Looks drawn in training pay at
-night."""
+night, in strict success."""
 
 
 def results_page(results: Results, cells: Sequence[str], segmenter: Mapping[str, Any]) -> str:
