@@ -227,6 +227,8 @@ def write_report(training: Training, towns: dict[str, Town], copied: Sequence[st
     taken = [f"{level} from {cfg.start_from[level]}" for level in sorted(levels, reverse=True)]
     details = {
         "Model": f"{cfg.model}, {cfg.modality}",
+        "Episodes": "misleading" if cfg.misleading else "built-in",
+        "Settings": f"appearance={cfg.appearance}, segmenter={cfg.segmenter}, misleading={cfg.misleading}",
         "Started from": "; ".join(taken) or "nothing",
         "Trained": "; ".join(trained) or "nothing",
         "Seed": str(cfg.seed),

@@ -78,10 +78,13 @@ class Cell:
     def origin(self) -> dict[str, Any]:
         """What it is made from: if this has changed, so has the cell."""
         settings = OmegaConf.merge(*(OmegaConf.load(RECIPES / "config" / file) for file in self.settings))
+        weights = [folder / WEIGHTS for folder in self.needs]
+        if "modality=ps" in self.arguments:
+            weights.append(SHIPPED / "road-segmenter" / "model.safetensors")
         return {
             "command": shlex.join(("python", f"recipes/{self.recipe}", *self.arguments)),
             "settings": digest(json.dumps(OmegaConf.to_container(settings)).encode()),
-            "weights": [digest((folder / WEIGHTS).read_bytes()) for folder in self.needs],
+            "weights": [digest(file.read_bytes()) for file in weights],
         }
 
     def finished(self) -> bool:

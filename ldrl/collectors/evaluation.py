@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ldrl import keys
-from ldrl.envs import Episode, make_env
+from ldrl.envs import Episode, RoadSegmenter, make_env
 from ldrl.envs.town import STANDING_SPEED
 from ldrl.subtasks import SubTask
 from ldrl.towns import Town
@@ -38,7 +38,7 @@ class Outcome:
             should stop, it must also stand at the end, within 10 m of the path's last point.
         strict_success: success, never off the road or in an oncoming lane, and ``finish`` declared within 15 m of the
             path's end.
-        collision: whether the car hit a building.
+        collision: whether the car hit a building or another car.
         off_road: whether a corner of the car left the road.
         wrong_lane: whether the car was in an oncoming lane outside junctions.
         finished: whether the agent declared ``finish``.
@@ -78,7 +78,7 @@ def evaluate(
     *,
     num_cars: int = 64,
     appearance: str | int = "clear",
-    segmenter: str | Path = "road-segmenter",
+    segmenter: str | Path | RoadSegmenter = "road-segmenter",
     device: torch.device | str = "cpu",
     progress: Callable[[int], object] | None = None,
 ) -> list[Outcome]:
@@ -92,7 +92,7 @@ def evaluate(
         num_cars: episodes driven side by side.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`. That of
             ``"episode"`` depends on the row and on ``num_cars``.
-        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
+        segmenter: what ``"ps"`` sees with: weights, or a :class:`~ldrl.envs.RoadSegmenter`.
         device: where to drive; an agent must be there, too.
         progress: called with the number of episodes done after each batch of them.
 

@@ -2,11 +2,11 @@
 
 from ldrl.envs.camera import DashCamera
 from ldrl.envs.episodes import Episode, builtin_episodes, load_episodes, save_episodes
-from ldrl.envs.factory import make_camera, make_env, make_highway_env
+from ldrl.envs.factory import Modality, make_camera, make_env, make_highway_env
 from ldrl.envs.highway import HighwayTownEnv
 from ldrl.envs.instruction import Instruction
 from ldrl.envs.labels import SubtaskLabels
-from ldrl.envs.misleading import misleading_episodes
+from ldrl.envs.misleading import misleading_episodes, misleading_routes
 from ldrl.envs.segmenter import RoadSegmenter
 from ldrl.envs.town import TownEnv
 
@@ -15,6 +15,7 @@ __all__ = [
     "Episode",
     "HighwayTownEnv",
     "Instruction",
+    "Modality",
     "RoadSegmenter",
     "SubtaskLabels",
     "TownEnv",
@@ -24,5 +25,6 @@ __all__ = [
     "make_env",
     "make_highway_env",
     "misleading_episodes",
+    "misleading_routes",
     "save_episodes",
 ]

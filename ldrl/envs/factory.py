@@ -31,7 +31,7 @@ def make_camera(
     modality: Modality = "gs",
     *,
     appearance: str | int = "clear",
-    segmenter: str | Path = "road-segmenter",
+    segmenter: str | Path | RoadSegmenter = "road-segmenter",
     seed: int = 0,
 ) -> Transform:
     """What draws the images of a modality, in an env or in a replay buffer.
@@ -41,7 +41,7 @@ def make_camera(
         modality: ``"gs"``, the road; ``"rgb"``; or ``"ps"``, the road that a :class:`~ldrl.envs.RoadSegmenter` sees in
             the rgb images.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
-        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
+        segmenter: what ``"ps"`` sees with: weights, or a :class:`~ldrl.envs.RoadSegmenter`.
         seed: of the appearances.
 
     Examples:
@@ -51,7 +51,8 @@ def make_camera(
         torch.Size([5, 1, 88, 200])
     """
     if modality == "ps":
-        return Compose(DashCamera(town, modality="rgb", appearance=appearance, seed=seed), RoadSegmenter(segmenter))
+        seen = segmenter.clone() if isinstance(segmenter, RoadSegmenter) else RoadSegmenter(segmenter)
+        return Compose(DashCamera(town, modality="rgb", appearance=appearance, seed=seed), seen)
     return DashCamera(town, modality=modality, appearance=appearance, seed=seed)
 
 
@@ -63,7 +64,7 @@ def make_env(
     policy: TensorDictModuleBase | None = None,
     modality: Modality | None = None,
     appearance: str | int = "clear",
-    segmenter: str | Path = "road-segmenter",
+    segmenter: str | Path | RoadSegmenter = "road-segmenter",
     max_steps: int = 1000,
     traffic: int = 0,
     device: torch.device | str = "cpu",
@@ -78,7 +79,7 @@ def make_env(
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         modality: of the images, see :func:`make_camera`; None for what the policy is made for, or ``"gs"``.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
-        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
+        segmenter: what ``"ps"`` sees with: weights, or a :class:`~ldrl.envs.RoadSegmenter`.
         max_steps: length of a roaming episode.
         traffic: other cars in each world.
         device: where the tensors are.
@@ -103,7 +104,7 @@ def make_highway_env(
     policy: TensorDictModuleBase | None = None,
     modality: Modality | None = None,
     appearance: str | int = "clear",
-    segmenter: str | Path = "road-segmenter",
+    segmenter: str | Path | RoadSegmenter = "road-segmenter",
     config: dict | None = None,
     seed: int = 0,
 ) -> TransformedEnv:
@@ -115,7 +116,7 @@ def make_highway_env(
         policy: what is to drive; the env then holds its memory, and draws images only if it reads them.
         modality: of the images, see :func:`make_camera`; None for what the policy is made for, or ``"gs"``.
         appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`.
-        segmenter: weights of ``"ps"``, see :class:`~ldrl.envs.RoadSegmenter`.
+        segmenter: what ``"ps"`` sees with: weights, or a :class:`~ldrl.envs.RoadSegmenter`.
         config: further settings of :class:`~ldrl.envs.HighwayTownEnv`, such as ``vehicles_count``.
         seed: of the env, the instructions and the appearances; ``env.set_seed`` reaches only the first, so parallel
             workers need one each.

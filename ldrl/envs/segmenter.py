@@ -40,7 +40,8 @@ class RoadSegmenter(Transform):
     Args:
         name: weights that ship with the package, a folder, or a model on the Hugging Face Hub, which is then
             downloaded. There must be a ``preprocessor_config.json`` with them.
-        road: the class that means road, by its name in the weights' ``id2label`` or by its number.
+        road: the class that means road, by its number or a name that it has in the weights' ``id2label``, where
+            "road, route" is two names.
 
     Raises:
         ImportError: ``transformers`` is missing.
@@ -141,10 +142,10 @@ def _no_progress_bar(settings: ModuleType) -> Iterator[None]:
 def _class_number(names: dict[int, str], road: str | int) -> int:
     """The number of the class that means road."""
     for number, name in names.items():
-        if road in (number, name):
+        if road in (number, name, *name.split(", ")):
             return number
     listed = ", ".join(f"{number} {name!r}" for number, name in names.items())
-    raise ValueError(f"the weights know no class {road!r}; set road to the one that means road: {listed}")
+    raise ValueError(f"the weights know no class {road!r}; give RoadSegmenter road=, the one that means road: {listed}")
 
 
 def _for_inference(network: MobileNetV2ForSemanticSegmentation) -> nn.Module:

@@ -1,4 +1,4 @@
-"""Four families of sentences that try a listener: never to be trained on, nor tuned to."""
+"""Four families of sentences that try a listener: never to be trained on, nor looked at to train better."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Families:
     """The sentences of one family, for every keyword.
 
     Paraphrases and ambiguities are products of the parts in ``families/*.yaml``. Noise is a held-out sentence with
-    slips (:func:`~ldrl.language.slips.slip`), rambling a held-out sentence among small talk and corrections, so that
-    these two measure the disturbance alone.
+    slips (:func:`~ldrl.language.slips.slip`), rambling mostly one among small talk and corrections, so that these two
+    measure little but the disturbance.
 
     Args:
         family: which one.

@@ -101,6 +101,17 @@ def test_weights_of_the_segmenter_from_a_folder(town2, tmp_path):
         make_env(town2, 2, modality="ps", segmenter=tmp_path)
 
 
+def test_a_segmenter_of_ones_own_in_several_envs(town2):
+    segmenter = RoadSegmenter(road="background")
+    shipped, *own = (
+        make_env(town2, 2, modality="ps", segmenter=given) for given in ("road-segmenter", segmenter, segmenter)
+    )
+    road, *other = (env.reset()[keys.IMAGE][..., 44:, :] for env in (shipped, *own))
+    assert 0 < (road == 255).float().mean() < 1
+    assert all(torch.equal(255 - road, images) for images in other)
+    assert segmenter.parent is None
+
+
 def test_appearance_per_episode(town2):
     env, again = (make_env(town2, 3, modality="rgb", appearance="episode", seed=5) for _ in range(2))
     td = env.reset()

@@ -133,6 +133,8 @@ def test_unknown_classes_and_weights(tmp_path):
         RoadSegmenter(folder)
     with pytest.raises(ValueError, match="no class 2"):
         RoadSegmenter(folder, road=2)
+    save(folder, ["railroad", "road, route", "car"])
+    assert RoadSegmenter(folder).road == 1
     (folder / PREPROCESSING).unlink()
     with pytest.raises(ValueError, match=rf"no segmenter.*{PREPROCESSING}.*road-segmenter"):
         RoadSegmenter(folder, road="car")

@@ -66,6 +66,8 @@ def test_no_word_is_misheard_as_in_training():
     spoken = yaml.safe_load((resources.files("ldrl.language") / "spoken.yaml").read_text("utf-8"))
     misheard = read("families")["noise"]["misheard"]
     assert set(misheard) & set(spoken["slips"])
+    words = [word for slips in (misheard, spoken["slips"]) for slip in slips.items() for word in (slip[0], *slip[1])]
+    assert {type(word) for word in words} == {str}, "quote what YAML takes for a truth value: on, off, yes, no"
     heard = {(word, " ".join(normalise(said))) for word, others in misheard.items() for said in others}
     shared = {(word, said) for word, others in spoken["slips"].items() for said in others} & heard
     assert not shared, "slips of the training that the blind test makes as well: take others"

@@ -190,6 +190,7 @@ def test_evaluate_says_that_a_map_has_no_junction(trained, tmp_path, call, monke
     ("arguments", "asked"),
     [
         (["episodes=builtin"], [("town1", "heldout", {}), ("town2", "heldout", {})]),
+        (["episodes=builtin", "appearance=rain"], [("town1", "heldout", {}), ("town2", "heldout", {})]),
         (["episodes=noise"], [("town1", "noise", {}), ("town2", "noise", {})]),
         (["episodes=misleading", "routes_per_keyword=3"], [(k, "misleading", {"most_routes": 3}) for k in TOWNS]),
         (["episodes=unseen", "unseen_towns=2"], [(k, "heldout", {"most_routes": 2}) for k in ("town1", "town2")]),
@@ -207,12 +208,13 @@ def test_evaluate_plans_what_is_asked_for(trained, episodes, towns, tmp_path, ca
     monkeypatch.setattr("ldrl.envs.misleading_episodes", plan)
     load = Town.load
     monkeypatch.setattr(Town, "load", lambda name: load(name.replace("random-0", "town1").replace("random-1", "town2")))
-    printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", "appearance=rain", *arguments, cwd=tmp_path)
+    printed, error = call("evaluate.py", f"checkpoint={cwd}/runs/brief", *arguments, cwd=tmp_path)
     assert error in (None, 0)
     assert found == asked
     assert "100%" in printed
-    # The paper reports nothing of other sentences and other towns.
-    assert ("0.9" in printed.split("| paper |")[1]) == (arguments[0] in ("episodes=builtin", "episodes=misleading"))
+    # The paper reports nothing of other sentences, towns and weathers.
+    in_paper = {"episodes=builtin", "episodes=misleading"} & {*arguments} and "appearance=rain" not in arguments
+    assert ("0.9" in printed.split("| paper |")[1]) == bool(in_paper)
 
 
 def test_odd_instructions_are_no_errors(trained, some, tmp_path, call):
@@ -389,8 +391,10 @@ def test_misleading_and_looks_reach_the_training(trained, tmp_path, call, monkey
     looks = [settings["appearance"] for settings in made[DashCamera]]
     assert looks[:2] == [7, 7]  # the check of the settings, and the images of the training
     assert set(looks[2:]) == {"clear"}
-    driven = json.loads((tmp_path / "runs" / "safe" / "report.json").read_text())["episodes"]
-    assert all("-misleading-" in record["id"] for record in driven)
+    report = json.loads((tmp_path / "runs" / "safe" / "report.json").read_text())
+    assert all("-misleading-" in record["id"] for record in report["episodes"])
+    assert report["details"]["Episodes"] == "misleading"
+    assert report["details"]["Settings"] == "appearance=7, segmenter=road-segmenter, misleading=0.25"
 
 
 def test_a_batch_whose_gradient_overflows_is_left_out_and_told(tmp_path, capsys):

@@ -17,6 +17,7 @@ from ldrl.collectors import results_page
 from ldrl.collectors.paper import SUCCESS, TARGETS
 from ldrl.collectors.results import Results
 from ldrl.envs.appearance import appearance_number
+from ldrl.envs.segmenter import SHIPPED
 from ldrl.modules import AgentConfig
 from ldrl.towns import Town
 
@@ -159,6 +160,16 @@ def test_settings_that_change_under_way_are_not_what_a_cell_was_made_with(reprod
     made, _, printed = reproduce("tables=[unseen]")
     assert sorted(made) == ["seed0/gs-low", "seed0/reader"]
     assert "seed0/reader: other settings than before, so it is made again" in printed
+
+
+def test_cells_on_ps_are_made_again_with_another_segmenter(reproduce, monkeypatch, tmp_path):
+    reproduce("tables=[input]")
+    folder = tmp_path / "road-segmenter"
+    shutil.copytree(SHIPPED / "road-segmenter", folder)
+    (folder / "model.safetensors").write_bytes(b"other")
+    monkeypatch.setattr("ldrl.envs.segmenter.SHIPPED", tmp_path)
+    made, _, _ = reproduce("tables=[input]")
+    assert sorted(made) == [f"seed0/ps-{model}" for model in ("h0", "hi", "hih")]
 
 
 def test_the_same_weights_again_leave_what_starts_from_them(reproduce):
