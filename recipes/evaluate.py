@@ -34,22 +34,28 @@ from ldrl.towns import LAYOUTS, Town
 
 FAMILIES = get_args(Family)
 SETS = ("builtin", *FAMILIES, "misleading", "unseen")
+TOWNS_AT_ONCE = 10
+"""How many of the unseen towns are driven in side by side."""
 
 
 def choose_episodes(cfg: DictConfig) -> Iterator[tuple[dict[str, Town], list[Episode]]]:
-    """Towns and their episodes; planned ones a town at a time, so that many towns need no memory together."""
+    """Towns and their episodes; some unseen towns at a time, so that many need no memory together."""
     source = str(cfg.episodes)
     most = {} if cfg.routes_per_keyword is None else {"most_routes": cfg.routes_per_keyword}
     if source == "unseen":
-        for k in range(cfg.unseen_towns):
-            town = Town.load(f"random-{k}")
-            yield {town.name: town}, builtin_episodes(town, **({"most_routes": 2} | most))
+        for first in range(0, cfg.unseen_towns, TOWNS_AT_ONCE):
+            numbers = range(first, min(first + TOWNS_AT_ONCE, cfg.unseen_towns))
+            towns = {town.name: town for town in (Town.load(f"random-{k}") for k in numbers)}
+            few = {"most_routes": 2} | most
+            yield towns, [episode for town in towns.values() for episode in builtin_episodes(town, **few)]
     elif source in SETS or source.endswith(".xodr"):
-        for town in map(Town.load, LAYOUTS if source in SETS else [source]):
-            if source == "misleading":
-                yield {town.name: town}, misleading_episodes(town, **most)
-            else:
-                yield {town.name: town}, builtin_episodes(town, source if source in FAMILIES else "heldout", **most)
+        towns = {town.name: town for town in map(Town.load, LAYOUTS if source in SETS else [source])}
+        if source == "misleading":
+            planned = [misleading_episodes(town, **most) for town in towns.values()]
+        else:
+            split = source if source in FAMILIES else "heldout"
+            planned = [builtin_episodes(town, split, **most) for town in towns.values()]
+        yield towns, list(chain.from_iterable(planned))
     elif Path(source).is_file():
         towns = {name: Town.load(name) for name in LAYOUTS}
         yield towns, load_episodes(source, towns)

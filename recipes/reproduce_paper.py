@@ -45,6 +45,8 @@ TRAINING, EVALUATION = "bc_hierarchical.py", "evaluate.py"
 OUTPUT = "output.txt"
 TAIL = 15
 """Lines of a failed cell's output that are shown."""
+KEEPS_MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": str(2**62)}
+"""Tells glibc to keep what is freed: else every batch asks the system for its memory again, a sixth of the time."""
 
 
 def digest(content: bytes) -> str:
@@ -107,7 +109,7 @@ class Cell:
                 [sys.executable, str(RECIPES / self.recipe), *self.arguments],
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, "OMP_NUM_THREADS": str(threads)},
+                env={**KEEPS_MEMORY, **os.environ, "OMP_NUM_THREADS": str(threads)},
             )
 
 

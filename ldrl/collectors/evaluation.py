@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 import torch
@@ -25,6 +27,8 @@ NEAR = 10.0
 """A drive succeeds that passes every point of the path, and its last, this close (paper's evaluation), m."""
 FINISH_NEAR = 15.0
 """Strictly, ``finish`` must be declared this close to the path's last point, m."""
+CARS_IN_ENV = 64
+"""An env draws what all its cars see until the last has ended; and each env has a fixed cost at every step."""
 RECORDED = (keys.POSE, keys.SPEED, keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
 
 
@@ -76,7 +80,7 @@ def evaluate(
     episodes: Sequence[Episode],
     towns: dict[str, Town],
     *,
-    num_cars: int = 64,
+    num_cars: int = 512,
     appearance: str | int = "clear",
     segmenter: str | Path | RoadSegmenter = "road-segmenter",
     device: torch.device | str = "cpu",
@@ -89,12 +93,12 @@ def evaluate(
             a town, such as :class:`~ldrl.collectors.Expert`.
         episodes: of any towns.
         towns: by name, all that the episodes name.
-        num_cars: episodes driven side by side.
-        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`. That of
-            ``"episode"`` depends on the row and on ``num_cars``.
+        num_cars: the most episodes driven side by side, of all towns; a policy is asked for all of them at once.
+        appearance: of what is seen in colour, see :class:`~ldrl.envs.DashCamera`. That of ``"episode"`` depends on the
+            other episodes of the town.
         segmenter: what ``"ps"`` sees with: weights, or a :class:`~ldrl.envs.RoadSegmenter`.
         device: where to drive; an agent must be there, too.
-        progress: called with the number of episodes done after each batch of them.
+        progress: called with the number of episodes done, some at a time.
 
     Returns:
         One outcome per episode, in the same order.
@@ -105,55 +109,74 @@ def evaluate(
     unknown = {episode.town for episode in episodes} - set(towns)
     if unknown:
         raise ValueError(f"unknown town {min(unknown)!r}; use one of {', '.join(towns)}")
-    outcomes: dict[int, Outcome] = {}
+    in_env = min(num_cars, CARS_IN_ENV)
+    parts = []
     for name, town in towns.items():
         rows = [i for i, episode in enumerate(episodes) if episode.town == name]
-        # Episodes of like length together: a batch drives until its last car is done.
+        # Episodes of like length together: an env drives until its last car is done.
         rows.sort(key=lambda i: len(episodes[i].path))
         there = town.on(device)
         actor = policy if isinstance(policy, TensorDictModuleBase) else policy(there)
-        for start in range(0, len(rows), num_cars):
-            batch = rows[start : start + num_cars]
-            env = make_env(
-                there,
-                episodes=[episodes[i] for i in batch],
-                policy=actor,
-                appearance=appearance,
-                segmenter=segmenter,
-                device=device,
-                seed=start,
-            )
-            for i, outcome in zip(batch, _drive(env, actor, [episodes[i] for i in batch]), strict=True):
-                outcomes[i] = outcome
-            if progress is not None:
-                progress(len(batch))
+        parts += [(actor, there, rows[first : first + in_env]) for first in range(0, len(rows), in_env)]
+    outcomes: dict[int, Outcome] = {}
+    see = partial(make_env, appearance=appearance, segmenter=segmenter, device=device)
+    for _, asking in groupby(parts, lambda part: id(part[0])):
+        same = list(asking)
+        for first in range(0, len(same), num_cars // in_env):
+            drives = []
+            for actor, there, rows in same[first : first + num_cars // in_env]:
+                own = [episodes[i] for i in rows]
+                drives.append(_Drives(see(there, episodes=own, policy=actor, seed=rows[0]), rows))
+            _drive(drives, same[first][0], progress)
+            for each in drives:
+                outcomes |= {i: _judge(episodes[i], drive) for i, drive in zip(each.rows, each.driven(), strict=True)}
     return [outcomes[i] for i in range(len(episodes))]
 
 
+class _Drives:
+    """Drives under way in one env, one in each row."""
+
+    def __init__(self, env: EnvBase, rows: list[int]) -> None:
+        self.env, self.rows = env, rows
+        self.tensordict = env.reset()
+        self.running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+        self.frames = [self.tensordict.select(*RECORDED)]
+        self.lengths = torch.ones(env.batch_size, dtype=torch.long, device=env.device)
+
+    def step(self, chosen: TensorDictBase) -> None:
+        """Do what was chosen in the rows that still drive; the others stay where they are, whatever it is."""
+        running = self.running
+        self.tensordict.update(chosen[(running.cumsum(0) - 1).clamp(min=0)])
+        tensordict = self.env.step(self.tensordict.set("_step", running))
+        # What was chosen belongs to the frame that it was chosen at.
+        self.frames[-1].update(tensordict.select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
+        self.frames.append(tensordict["next"].select(*RECORDED))
+        self.lengths += running
+        self.running = running & ~tensordict["next", "done"].squeeze(-1)
+        self.tensordict = step_mdp(tensordict)
+
+    def driven(self) -> list[TensorDictBase]:
+        """The frames of each drive, when all have ended."""
+        self.frames[-1].update(self.frames[-2].select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
+        frames = torch.stack(self.frames, 1).cpu()
+        return [frames[row, :length] for row, length in enumerate(self.lengths.tolist())]
+
+
 @torch.no_grad()
-def _drive(env: EnvBase, policy: TensorDictModuleBase, episodes: Sequence[Episode]) -> list[Outcome]:
-    """Drive one batch, each row until its own end."""
+def _drive(drives: list[_Drives], policy: TensorDictModuleBase, progress: Callable[[int], object] | None) -> None:
+    """Drive all to their ends, those of all envs side by side."""
     policy.eval()
-    tensordict = env.reset()
-    frames = [tensordict.select(*RECORDED)]
-    running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
-    mask = [running]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        while running.any():
-            # Only who still drives is asked; the others get what some car does, and stay where they are.
-            chosen = policy(tensordict[running]).select(*policy.out_keys)
-            tensordict.update(chosen[(running.cumsum(0) - 1).clamp(min=0)])
-            tensordict = env.step(tensordict.set("_step", running))
-            # What was chosen belongs to the frame that it was chosen at.
-            frames[-1].update(tensordict.select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
-            frames.append(tensordict["next"].select(*RECORDED))
-            mask.append(running)
-            running = running & ~tensordict["next", "done"].squeeze(-1)
-            tensordict = step_mdp(tensordict)
-    frames[-1].update(frames[-2].select(keys.AGENT_SUBTASK, keys.AGENT_FINISH, strict=False))
-    drives = torch.stack(frames, 1).cpu()
-    lengths = torch.stack(mask, 1).sum(1).tolist()
-    return [_judge(episode, drives[k, :n]) for k, (episode, n) in enumerate(zip(episodes, lengths, strict=True))]
+        counts = [len(each.rows) for each in drives]
+        while drives:
+            chosen = policy(torch.cat([each.tensordict[each.running] for each in drives])).select(*policy.out_keys)
+            for each, own in zip(drives, chosen.split(counts), strict=True):
+                each.step(own)
+            left = [int(each.running.sum()) for each in drives]
+            if progress is not None and left != counts:
+                progress(sum(counts) - sum(left))
+            drives = [each for each, count in zip(drives, left, strict=True) if count]
+            counts = [count for count in left if count]
 
 
 def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:

@@ -209,6 +209,21 @@ def test_exactly_one_drive_per_episode(sample, towns, monkeypatch):
     assert sum(ended) == 5
 
 
+@pytest.mark.parametrize(("num_cars", "at_first"), [(512, 5), (4, 3), (2, 2)])
+def test_who_still_drives_in_any_town_is_asked_at_once(sample, towns, monkeypatch, num_cars, at_first):
+    asked = []
+
+    class Counting(Dice):
+        def forward(self, tensordict):
+            asked.append(len(tensordict))
+            return super().forward(tensordict)
+
+    monkeypatch.setattr(evaluation, "CARS_IN_ENV", 2)
+    outcomes = evaluate(Counting(), sample[:5], towns, num_cars=num_cars)
+    assert asked[0] == max(asked) == at_first
+    assert sum(asked) == sum(len(outcome.track) - 1 for outcome in outcomes)
+
+
 @pytest.mark.parametrize("num_cars", [1, 5])
 def test_the_number_of_cars_changes_nothing(sample, towns, outcomes, num_cars):
     some = slice(0, 6)
