@@ -1,9 +1,11 @@
-"""The page of results: the paper's tables with ours beside them, and where ours fall short."""
+"""The page of results: the paper's tables with ours beside them, and where ours fall short, put into a page of text."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from statistics import mean
+from string import Template
 from typing import Any
 
 from ldrl.collectors.paper import LEAST_IOU, MOST_MINUTES, SUCCESS, TARGETS, Target
@@ -47,68 +49,6 @@ NAMES = {cell: name for table in (FULL, EVERY, MODELS) for name, cell in table.i
     **{cell: f"{model}, misleading instructions" for model, cell in MISLEADING.items()},
     **{cell: f"Hih, {family}" for family, cell in FAMILIES.items()},
 }
-INTRODUCTION = """\
-# Results
-
-The tables of Roh et al. 2019 with ours beside them. `python recipes/reproduce_paper.py` writes this page from
-`results.json` beside it and from the finished cells of `runs/paper`; a change by hand is lost.
-
-- *success*, the paper's measure: no collision, and every point of the path within 10 m of the track. *strict success*:
-  also never off the road, never in an oncoming lane, and `finish` declared within 15 m of the path's end. *paper*: what
-  it reports as success, on routes of its own in CARLA; train is Town 1, test Town 2. Where the map does not allow what
-  is asked and the car should stop, success also takes that it stands within 10 m of the path's end.
-- Trained in Town 1 and seven random towns. Episodes are all routes of our planner in Town 1 and Town 2, each driven
-  once, said in sentences without a phrase of the training's templates.
-- A figure is the mean over the seeds, in brackets the least and the largest of them. "-" is not measured yet, or not
-  reported by the paper."""
-DEPARTURES = """\
-These concern the tables above; [the design](design.md#departures-from-the-paper) has those of the whole system.
-
-1. **World.** Flat towns drawn from their lanes instead of CARLA. On rgb the figures compare worlds as well as agents:
-   CARLA's images are other ones than ours, and nobody has driven either agent in the other's.
-2. **Episodes** are all routes of our planner, so that nobody chooses among them, not the paper's 159 and 142; `all`
-   mixes the types in another proportion.
-3. **Training towns.** Town 1 and seven random towns, which have what Town 1 lacks: junctions of four streets. Town 2,
-   as in the paper, and the unseen towns are in no training; but the seven were chosen, for the width of their lanes,
-   after strict success in Town 2 and what was lost in unseen towns had shown that the width matters.
-4. **Sentences** come from our own templates on the paper's scale, as the paper's collected ones are not public;
-   evaluation says held-out ones only. Training hears none of these and none of the family of ambiguity word for word,
-   but for single bare words, and its table of mishearings shares none with that of noise. But some of its phrasings
-   were written to help where readings of held-out sentences had failed, and letters are misspelt at random in both.
-   What the reader knows of words and what training does to sentences was chosen by how much of each family is read
-   right, without a look at a sentence of them: *kept* may be a little better than it would be in a fifth family.
-5. **Sizes and schedule.** Networks of 1.2 million parameters with normalised convolutions, trained on CPU cores in the
-   times above.
-6. **The reader is learned first**, from sentences alone, and its encoder then stays as it is: sentences are cheap,
-   images are not. It reads both ways.
-7. **Models share what they can**, so that a table takes minutes: the low level is that of Hih where the paper's differ
-   in the high level only, and the high level of H0, Hi, NMC and the single policies starts from Hih's. NMC learns to
-   read anew from the words' encoder, without the attention, in 3,000 batches for Hih's 12,000. They are trained for
-   less long than Hih with its 2,400 batches: for 1,200, the single policies for 250 of whole drives. Hihg has Hih's
-   high level and trains 800 batches of the low level from Hih's with its 1,600.
-8. **Training on rgb starts from the agent on gs**: the same road in other colours, which saves most of it: 1,600
-   further batches of the low level and 1,200 of the high level. **ps is not trained on**: agents trained on gs drive on
-   it as they are. H0's high level sees no image, so that on rgb and ps it is that of gs.
-9. **Colours are seen relative to the road in front of the car and to the image's contrast, and looks are drawn for
-   every image of the training**; the table of looks shows what the latter is worth. All its rows have the former.
-10. **The segmenter of ps** is a small DeepLabv3+ trained on random towns of ours, the paper's on photographs. It is
-    trained once, in 36 minutes that are not among those below, and serves all seeds.
-11. **Views beside the path** are labelled by asking the expert there, where the paper shifts the steering of turned
-    cameras by a constant: recovery is learned exactly.
-12. **Recurrent states** run on through a sub-task, where the paper re-runs the last 10 frames at every step, which gave
-    an early agent nothing. But single policies that see 10 frames do better than those of Table 3 here, see
-    [the design](design.md#what-the-baselines-lack).
-13. **Misleading instructions** are a quarter of those in 1,200 further batches, which start from the agent that knows
-    none; the paper says no share. Where the car should stop, success is asked for more than in the other tables."""
-MODELS_NOTE = """\
-Single policies never declare `finish`, so none of their successes is strict. Table 3 gives 0.960 for the paper's Hih on
-doubles in Town 2 and Table 2 gives 0.986, which stands here. What the models that should fail do fail at is in
-[the design](design.md#what-the-baselines-lack)."""
-
-LOOKS_NOTE = """\
-The paper's agent falls in a town that looks otherwise, from 0.880 to 0.613. Ours hardly does by day, whatever it is
-trained on, as it starts from an agent on gs and sees colours relative to the road. Looks drawn in training pay at
-night, in strict success."""
 
 
 def results_page(results: Results, cells: Sequence[str], segmenter: Mapping[str, Any]) -> str:
@@ -119,37 +59,23 @@ def results_page(results: Results, cells: Sequence[str], segmenter: Mapping[str,
         cells: names of all cells, in the order of the table of times.
         segmenter: the report of the road segmenter's training.
     """
-    parts = [
-        INTRODUCTION,
-        f"Seeds: {', '.join(map(str, results.seeds)) or 'none yet'}.",
-        "## Where ours fall short",
-        *_shortfalls(results, cells, segmenter),
-        "## What should be reached",
-        _targets(results, segmenter),
-        "## Input modalities (the paper's Table 2)",
-        _table(results, "model", FULL, TYPES),
-        "## Models (Table 3), on gs",
-        _table(results, "model", MODELS, TYPES),
-        MODELS_NOTE,
-        "## All hierarchical models over all modalities (Table A3)",
-        _table(results, "model", EVERY, ("all",)),
-        "## Misleading instructions only, on gs",
-        _table(results, "model", MISLEADING | POSSIBLE, ("single", "double", "all")),
-        "## Families of sentences, Hih on gs",
-        _families(results),
-        "## Unseen towns, Hih on gs",
-        _unseen(results),
-        "## Looks in training, Hih on rgb",
-        _table(results, "looks", LOOKS, TYPES),
-        LOOKS_NOTE,
-        "## Road segmenter of ps",
-        _segmenter(segmenter),
-        "## Time",
-        *_time(results, cells),
-        "## Departures from the paper",
-        DEPARTURES,
-    ]
-    return "\n\n".join(parts) + "\n"
+    filled = {
+        "seeds": ", ".join(map(str, results.seeds)) or "none yet",
+        "shortfalls": "\n\n".join(_shortfalls(results, cells, segmenter)),
+        "targets": _targets(results, segmenter),
+        "modalities": _table(results, "model", FULL, TYPES),
+        "models": _table(results, "model", MODELS, TYPES),
+        "hierarchical": _table(results, "model", EVERY, ("all",)),
+        "misleading": _table(results, "model", MISLEADING | POSSIBLE, ("single", "double", "all")),
+        "families": _families(results),
+        "unseen": _unseen(results),
+        "looks": _table(results, "looks", LOOKS, TYPES),
+        "segmenter_training": segmenter["details"]["training"],
+        "segmenter": segmenter_table(segmenter["rows"]),
+        "time": "\n\n".join(_time(results, cells)),
+    }
+    page = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
+    return Template(page).substitute(filled)
 
 
 def _spread(values: Sequence[float], digits: int = 3) -> str:
@@ -243,12 +169,7 @@ def _families(results: Results) -> str:
             figures += [_spread(results.values(cell, town, "all", m)) for m in ("success", "strict_success")]
             figures.append(_spread(results.values(cell, town, "all", "kept")) if cell != "gs-hih" else "-")
         lines.append((family, *figures))
-    table = markdown_table(lines, left=1)
-    return (
-        f"{table}\n\nThe same routes in other sentences; noise, and rambling mostly, are the clean sentence of the "
-        "route with something done to it. *kept* is the rate of success over that on clean sentences. What is misread, "
-        "and what remedies gave, is in [the design](design.md#language)."
-    )
+    return markdown_table(lines, left=1)
 
 
 def _unseen(results: Results) -> str:
@@ -257,11 +178,7 @@ def _unseen(results: Results) -> str:
         episodes = results.values("gs-hih-unseen", "unseen", type_, "episodes")
         rates = [results.values("gs-hih-unseen", "unseen", type_, m) for m in ("success", "strict_success")]
         lines.append((type_, f"{mean(episodes):.0f}" if episodes else "-", *map(_spread, rates)))
-    table = markdown_table(lines, left=1)
-    return (
-        "Random towns, number 0 to 49 unless the command says otherwise, in which no agent was trained; two routes of "
-        f"every keyword in each.\n\n{table}"
-    )
+    return markdown_table(lines, left=1)
 
 
 def segmenter_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -276,11 +193,6 @@ def segmenter_table(rows: Sequence[Mapping[str, Any]]) -> str:
         both = (found[town, look] for town in ("town1", "town2"))
         lines.append((look, *(f"{row[name]:.3f}" for row in both for name in ("iou", "worst_view"))))
     return markdown_table(lines, left=1)
-
-
-def _segmenter(report: Mapping[str, Any]) -> str:
-    trained = report["details"]["training"]
-    return f"Intersection over union of the road. Trained: {trained}.\n\n{segmenter_table(report['rows'])}"
 
 
 def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:
