@@ -119,14 +119,14 @@ def evaluate(
         actor = policy if isinstance(policy, TensorDictModuleBase) else policy(there)
         parts += [(actor, there, rows[first : first + in_env]) for first in range(0, len(rows), in_env)]
     outcomes: dict[int, Outcome] = {}
-    see = partial(make_env, appearance=appearance, segmenter=segmenter, device=device)
-    for _, asking in groupby(parts, lambda part: id(part[0])):
-        same = list(asking)
+    make = partial(make_env, appearance=appearance, segmenter=segmenter, device=device)
+    for _, group in groupby(parts, lambda part: id(part[0])):  # of one policy
+        same = list(group)
         for first in range(0, len(same), num_cars // in_env):
             drives = []
             for actor, there, rows in same[first : first + num_cars // in_env]:
                 own = [episodes[i] for i in rows]
-                drives.append(_Drives(see(there, episodes=own, policy=actor, seed=rows[0]), rows))
+                drives.append(_Drives(make(there, episodes=own, policy=actor, seed=rows[0]), rows))
             _drive(drives, same[first][0], progress)
             for each in drives:
                 outcomes |= {i: _judge(episodes[i], drive) for i, drive in zip(each.rows, each.driven(), strict=True)}
