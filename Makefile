@@ -13,7 +13,7 @@ VENV := .venv
 STAMP := $(VENV)/.installed
 RUN := $(VENV)/bin/python
 
-# glibc keeps what is freed, instead of asking the system for the memory of every batch anew: a sixth of the time.
+# glibc keeps what is freed, instead of asking the system for the memory of every batch anew.
 export MALLOC_MMAP_MAX_ ?= 0
 export MALLOC_TRIM_THRESHOLD_ ?= 4611686018427387904
 

@@ -46,7 +46,7 @@ OUTPUT = "output.txt"
 TAIL = 15
 """Lines of a failed cell's output that are shown."""
 KEEPS_MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": str(2**62)}
-"""Tells glibc to keep what is freed: else every batch asks the system for its memory again, a sixth of the time."""
+"""Tells glibc to keep what is freed: else every batch asks the system for its memory again."""
 
 
 def digest(content: bytes) -> str:
