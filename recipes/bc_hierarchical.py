@@ -6,7 +6,7 @@
     python recipes/bc_hierarchical.py name=h0 model=h0             # another of the paper's models
     python recipes/bc_hierarchical.py name=rgb modality=rgb        # from colour images
     python recipes/bc_hierarchical.py name=safe misleading=0.25    # trained for what the map does not allow
-    python recipes/bc_hierarchical.py name=hi model=hi stages=[language,high_level] start_from.low_level=runs/h0
+    python recipes/bc_hierarchical.py name=hi model=hi "stages=[language,high_level]" start_from.low_level=runs/h0
 
 Results go to runs/<name>/: the checkpoint, report.md, report.json, pictures of the tracks, loss curves and a CSV log.
 """

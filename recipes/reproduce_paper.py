@@ -1,9 +1,9 @@
 """Train and evaluate what the paper's tables need, and write docs/results.md with ours beside the paper's figures.
 
     python recipes/reproduce_paper.py                       # all tables, one seed
-    python recipes/reproduce_paper.py seeds=[0,1,2]         # all three
-    python recipes/reproduce_paper.py tables=[models]       # only what one table needs
-    python recipes/reproduce_paper.py tables=[]             # only write the page again
+    python recipes/reproduce_paper.py "seeds=[0,1,2]"       # all three
+    python recipes/reproduce_paper.py "tables=[models]"     # only what one table needs
+    python recipes/reproduce_paper.py "tables=[]"           # only write the page again
     python recipes/reproduce_paper.py scale=smoke           # everything in little, to see it run
 
 A cell is one training with its evaluation, or one evaluation, done by a command that one may also type; which ones

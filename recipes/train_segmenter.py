@@ -5,7 +5,7 @@
     python recipes/train_segmenter.py steps=2 towns=1 frames=8 name=smoke    # everything once, to see it run
 
 Results go to runs/<name>/: the weights, which RoadSegmenter("runs/<name>") loads, report.md, report.json and
-views.png. It needs transformers: pip install "ldrl[ps]".
+views.png. It needs transformers.
 """
 
 from __future__ import annotations

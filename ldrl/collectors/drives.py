@@ -25,7 +25,7 @@ class DriveSampler(BoundarySampler):
     """Draws drives from where an instruction is given to behind the last manoeuvre, as many of each keyword.
 
     The batch size of the buffer counts frames, padding included. Each gets the instruction's tokens and ``mask``, False
-    for padding, which repeats the last frame. Sentences are drawn as by :class:`BoundarySampler`.
+    for padding, which repeats the last frame. Sentences are those of a passenger in training.
 
     Args:
         buffer: demonstrations.

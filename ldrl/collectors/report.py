@@ -51,7 +51,7 @@ def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     Returns:
         ``{"episodes", "success", "strict_success", "stuck", "towns": {town: {the same four, "types", "keywords"}}}``,
         where ``types`` and ``keywords`` map each name that occurs to the same four. Success rates lie in [0, 1],
-        rounded to 4 digits, None for no episode; the others are counts.
+        rounded to 6 digits, None for no episode; the others are counts.
     """
     towns = {}
     for town in dict.fromkeys(outcome.episode.town for outcome in outcomes):
@@ -75,8 +75,8 @@ def _rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     count = len(outcomes)
     return {
         "episodes": count,
-        "success": round(sum(o.success for o in outcomes) / count, 4) if count else None,
-        "strict_success": round(sum(o.strict_success for o in outcomes) / count, 4) if count else None,
+        "success": round(sum(o.success for o in outcomes) / count, 6) if count else None,
+        "strict_success": round(sum(o.strict_success for o in outcomes) / count, 6) if count else None,
         "stuck": sum(o.stuck for o in outcomes),
     }
 

@@ -57,7 +57,7 @@ def measure(records: Iterable[Mapping[str, Any]]) -> Rates:
         records: those of a report's ``"episodes"``.
 
     Returns:
-        Rates rounded to 4 digits. The types of ``"unseen"`` are also towns with four-way junctions, those without, and
+        Rates rounded to 6 digits. The types of ``"unseen"`` are also towns with four-way junctions, those without, and
         the town with the fewest successes.
     """
     groups: dict[str, dict[str, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
@@ -82,7 +82,7 @@ def measure(records: Iterable[Mapping[str, Any]]) -> Rates:
 
 
 def _rate(records: Sequence[Mapping[str, Any]], measure: str) -> float:
-    return round(sum(record[measure] for record in records) / len(records), 4)
+    return round(sum(record[measure] for record in records) / len(records), 6)
 
 
 @cache

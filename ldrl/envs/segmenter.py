@@ -105,7 +105,7 @@ def _load(name: str | Path) -> tuple[MobileNetV2ForSemanticSegmentation, ImageFo
     try:
         transformers = import_module("transformers")
     except ImportError as error:
-        raise ImportError(f"RoadSegmenter needs transformers ({error}); pip install 'ldrl[ps]'") from error
+        raise ImportError(f"RoadSegmenter needs transformers ({error}); pip install transformers") from error
     local = Path(name).is_dir()
     try:
         with _no_progress_bar(transformers.utils.logging):

@@ -72,7 +72,7 @@ def test_summary_counts_per_town_type_and_keyword(outcomes):
         "stuck": 1,
     }
     town1 = summary["towns"]["town1"]
-    assert (town1["episodes"], town1["success"], town1["strict_success"], town1["stuck"]) == (3, 0.6667, 0.3333, 1)
+    assert (town1["episodes"], town1["success"], town1["strict_success"], town1["stuck"]) == (3, 0.666667, 0.333333, 1)
     assert town1["types"] == {
         "single": {"episodes": 2, "success": 1.0, "strict_success": 0.5, "stuck": 0},
         "ordinal": {"episodes": 1, "success": 0.0, "strict_success": 0.0, "stuck": 1},

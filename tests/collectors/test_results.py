@@ -48,7 +48,7 @@ def test_rates_by_hand():
         "town1": {
             "single": {"episodes": 1, "success": 1.0, "strict_success": 0.0},
             "double": {"episodes": 2, "success": 0.5, "strict_success": 0.5},
-            "all": {"episodes": 3, "success": 0.6667, "strict_success": 0.3333},
+            "all": {"episodes": 3, "success": 0.666667, "strict_success": 0.333333},
         }
     }
 
