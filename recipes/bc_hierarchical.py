@@ -82,6 +82,7 @@ class Training:
                     raise ValueError(f"demonstration_frames is {cfg.demonstration_frames}; {path} has {count}, set it")
         shutil.rmtree(folder / "log", ignore_errors=True)  # of a run of the same name: the logger would append to it
         self.logger = CSVLogger("log", str(folder))
+        self.sequences: list[BoundarySampler] = []
         self.history: dict[str, list[float]] = {}
         self.batches: dict[str, int] = {}
 
@@ -95,6 +96,14 @@ class Training:
                 demonstrations = collect_demonstrations(town, cfg.demonstration_frames, path=path, seed=cfg.seed)
             driven.append((town, demonstrations, 100 * cfg.seed + k))
         return driven
+
+    def find_sequences(self) -> None:
+        """Find what the high level learns from in each town; a single policy learns from whole drives."""
+        for town, drives, seed in self.driven:
+            if isinstance(self.agent, HierarchicalAgent):
+                self.sequences.append(BoundarySampler(drives, town, seed=seed, misleading=self.cfg.misleading))
+            else:
+                self.sequences.append(DriveSampler(drives, town, self.cfg.drive_length, seed=seed))
 
     def fit(self, title: str, losses: Sequence[LossModule], buffers: Sequence[Buffer], rows: int) -> None:
         """Minimise losses together over ``cfg.<title>_steps`` batches of ``rows`` sequences, of each buffer in turn."""
@@ -134,7 +143,7 @@ class Training:
             transforms.append(DeviceCastTransform(cfg.device))
             if isinstance(sampler, SnippetSampler) or keys.IMAGE in self.policy.in_keys:
                 looks = {"appearance": cfg.appearance, "segmenter": cfg.segmenter}
-                camera = make_camera(town, cfg.modality, seed=seed, **looks).to(cfg.device)
+                camera = make_camera(town.on(cfg.device), cfg.modality, seed=seed, **looks).to(cfg.device)
                 transforms.append(camera if isinstance(sampler, SnippetSampler) else OncePerFrame(camera))
             shown = {"batch_size": frames, "transform": Compose(*transforms)}
             buffers.append(Buffer(storage=demonstrations.storage, sampler=sampler, **shown))
@@ -160,15 +169,12 @@ class Training:
         encoder: nn.Module = self.policy.reader[0]
         encoder.requires_grad_(False)
         if isinstance(self.agent, HierarchicalAgent):
-            settings = {"misleading": cfg.misleading}
-            samplers = [BoundarySampler(drives, town, seed=seed, **settings) for town, drives, seed in self.driven]
-            frames = cfg.batch_sequences * samplers[0].decisions
-            decisions = self.views(samplers, frames, 1, lateral=0.3, yaw=0.1)
+            frames = cfg.batch_sequences * self.sequences[0].decisions
+            decisions = self.views(self.sequences, frames, 1, lateral=0.3, yaw=0.1)
             self.fit("high_level", [SubtaskLoss(self.policy)], decisions, cfg.batch_sequences)
         else:
             length = cfg.drive_length
-            samplers = [DriveSampler(drives, town, length, seed=seed) for town, drives, seed in self.driven]
-            drives = self.views(samplers, cfg.batch_drives * length, length)
+            drives = self.views(self.sequences, cfg.batch_drives * length, length)
             self.fit("drives", [SinglePolicyLoss(self.policy)], drives, cfg.batch_drives)
         encoder.requires_grad_(True)
 
@@ -181,22 +187,43 @@ def reads(copied: Sequence[str]) -> bool:
 
 def check(cfg: DictConfig) -> None:
     """Raise a ValueError for settings of which nothing can be made."""
+    check_names(cfg)
+    check_numbers(cfg)
+
+
+def check_names(cfg: DictConfig) -> None:
+    """Raise a ValueError for a wrong name or list of names."""
     for name in ("towns", "test_towns", "stages"):
         if not OmegaConf.is_list(cfg[name]):
             raise ValueError(f"{name} is {cfg[name]!r}; give a list, such as {name}=[{cfg[name]}]")
         if not cfg[name] and name != "stages":
             raise ValueError(f"{name} is empty; give at least one, such as {name}=[town1]")
+    for name in ("towns", "test_towns"):
+        known = [Path(str(town)).name for town in cfg[name]]
+        if len(set(known)) < len(known):  # a map is known by its file's name
+            raise ValueError(f"{name} is {cfg[name]}; give each town once, and maps whose files have other names")
+    unknown = set(cfg.stages) - set(STAGES)
+    if unknown:
+        raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
+    if cfg.appearance == "episode":
+        raise ValueError("appearance is 'episode', but training has frames, not episodes; use sample, or a weather")
+    if str(cfg.name) in ("", ".") or Path(str(cfg.name)).is_absolute() or ".." in Path(str(cfg.name)).parts:
+        raise ValueError(f"name is {cfg.name!r}; give that of a folder below runs/, such as hierarchical-gs")
+
+
+def check_numbers(cfg: DictConfig) -> None:
+    """Raise a ValueError for a wrong number."""
     least = dict.fromkeys(COUNTS, 1) | {"seed": 0}
     if cfg.episodes_per_keyword is not None:
         least["episodes_per_keyword"] = 0
     check_whole_numbers(cfg, least)
-    if not isinstance(cfg.misleading, int | float) or not 0 <= cfg.misleading <= 1:
+    if type(cfg.misleading) not in (int, float) or not 0 <= cfg.misleading <= 1:
         raise ValueError(f"misleading is {cfg.misleading}; give a share from 0 to 1")
+    for name in ("learning_rate", "max_grad_norm"):
+        if type(cfg[name]) not in (int, float) or not cfg[name] > 0:
+            raise ValueError(f"{name} is {cfg[name]!r}; give a number above 0")
     if cfg.sentences < cfg.batch_sentences:
         raise ValueError(f"sentences is {cfg.sentences}; give at least a batch of them, {cfg.batch_sentences}")
-    unknown = set(cfg.stages) - set(STAGES)
-    if unknown:
-        raise ValueError(f"stages has {min(unknown)!r}; use some of {', '.join(STAGES)}")
 
 
 def choose_episodes(cfg: DictConfig, towns: dict[str, Town]) -> list[Episode]:
@@ -238,6 +265,8 @@ def write_report(training: Training, towns: dict[str, Town], copied: Sequence[st
         "Versions": f"Python {platform.python_version()}, torch {torch.__version__}",
     }
     write_json(outcomes, folder / "report.json", details)
+    for old in folder.glob("tracks_*.png"):
+        old.unlink()
     for town in towns.values():
         plot_tracks(outcomes, town, folder / f"tracks_{town.name}.png")
     paper = paper_success(agent.config, misleading=bool(cfg.misleading))
@@ -278,17 +307,20 @@ def main(cfg: DictConfig) -> None:
         make_camera(town, cfg.modality, appearance=cfg.appearance, segmenter=cfg.segmenter)
         training = Training(cfg, agent, folder)
         folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, folder / "config.yaml")
     except (ImportError, OSError, ValueError, RuntimeError, AssertionError) as error:  # the last two: no such device
         sys.exit(f"error: {error}")
 
     began = time.perf_counter()
     try:
+        if "high_level" in stages:  # if there are too few, that shows before anything is learned
+            training.find_sequences()
         for stage in stages:
             getattr(training, stage)()
     except ValueError as error:  # too few demonstrations, or a batch that does not divide
         sys.exit(f"error: {error}")
+    (folder / "losses.png").unlink(missing_ok=True)
     save_agent(agent, folder)
+    OmegaConf.save(cfg, folder / "config.yaml")
     losses = {name: values for name, values in training.history.items() if name.startswith("loss_")}
     if losses:
         plot_losses(losses, folder / "losses.png")

@@ -64,6 +64,7 @@ class Cell:
         settings: the files below ``config`` that it reads, a later one's values replace an earlier one's.
         arguments: of the recipe.
         needs: folders of the cells that must be finished before, whose checkpoints it takes.
+        makes: what it leaves in its folder for others.
     """
 
     folder: Path
@@ -71,6 +72,7 @@ class Cell:
     settings: tuple[str, ...]
     arguments: tuple[str, ...]
     needs: tuple[Path, ...]
+    makes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -91,8 +93,7 @@ class Cell:
 
     def finished(self) -> bool:
         """Whether nothing is to be done; cells that it needs must be finished."""
-        weights = [WEIGHTS] if self.recipe == TRAINING else []
-        if not all((self.folder / file).is_file() for file in (MADE, REPORT, *weights)):
+        if not all((self.folder / file).exists() for file in (MADE, REPORT, *self.makes)):
             return False
         made = json.loads((self.folder / MADE).read_text(encoding="utf-8"))
         changed = [what for what, value in self.origin().items() if made.get(what) != value]
@@ -129,10 +130,11 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
             given = dict(table[name])
             taken = tuple(folder / needed for needed in needs(given))
             if "checkpoint" in given:
-                recipe, read = EVALUATION, ("evaluate.yaml",)
+                recipe, read, makes = EVALUATION, ("evaluate.yaml",), ()
                 given |= {"checkpoint": taken[0], "out": folder / name / REPORT, **settings.evaluation}
             else:
                 recipe = TRAINING
+                makes = (WEIGHTS, "demonstrations") if name == cfg.collects else (WEIGHTS,)
                 read = ("bc_hierarchical.yaml", "preset/default.yaml", f"preset/{cfg.scale}.yaml", "size/small.yaml")
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
@@ -142,7 +144,8 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                         if steps in settings.again:
                             given.setdefault(steps, settings.again[steps])
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
-            cells.append(Cell(folder / name, recipe, read, tuple(argument(*item) for item in given.items()), taken))
+            arguments = tuple(argument(*item) for item in given.items())
+            cells.append(Cell(folder / name, recipe, read, arguments, taken, makes))
     return cells
 
 

@@ -68,8 +68,9 @@ class Views:
 
     def __init__(self, town: Town, appearance: str, crowded: float, seed: int, device: str) -> None:
         self.town, self.crowded, self.device = town, crowded, device
-        self.rgb = DashCamera(town, modality="rgb", appearance=appearance, seed=seed).to(device)
-        self.gs = DashCamera(town).to(device)
+        seen = town.on(device)
+        self.rgb = DashCamera(seen, modality="rgb", appearance=appearance, seed=seed).to(device)
+        self.gs = DashCamera(seen).to(device)
         self._generator = torch.Generator().manual_seed(seed)
 
     def draw(self, count: int) -> View:
@@ -158,7 +159,8 @@ def check(cfg: DictConfig) -> None:
     check_whole_numbers(cfg, {"seed": 0, "first_town": 0, "towns": 1, "steps": 1, "batch": 1, "frames": 1})
     if cfg.first_row not in range(88):
         raise ValueError(f"first_row is {cfg.first_row!r}; give a row of the image, 0 to 87")
-    if len(cfg.input_size) != 2 or not all(type(value) is int and value > 0 for value in cfg.input_size):
+    rows_and_columns = OmegaConf.is_list(cfg.input_size) and len(cfg.input_size) == 2
+    if not rows_and_columns or not all(type(value) is int and value > 0 for value in cfg.input_size):
         raise ValueError(f"input_size is {cfg.input_size}; give rows and columns, such as [44,100]")
 
 

@@ -81,7 +81,8 @@ def collect_demonstrations(
         town: where to drive.
         frames: how many frames, a multiple of ``num_cars``.
         num_cars: cars that drive side by side; each drives ``frames / num_cars`` frames.
-        path: folder of the memory-mapped storage, for :func:`load_demonstrations`; None for temporary files.
+        path: folder of the memory-mapped storage, for :func:`load_demonstrations`; another one there is overwritten.
+            None for temporary files.
         noise: scale of :class:`SteeringNoise`.
         seed: of cars and noise.
 

@@ -104,8 +104,10 @@ def evaluate(
         One outcome per episode, in the same order.
 
     Raises:
-        ValueError: an episode of an unknown town, or one whose start or path is off the road.
+        ValueError: an episode of an unknown town, or one whose start or path is off the road; no cars.
     """
+    if num_cars < 1:
+        raise ValueError(f"num_cars is {num_cars}; give at least 1")
     unknown = {episode.town for episode in episodes} - set(towns)
     if unknown:
         raise ValueError(f"unknown town {min(unknown)!r}; use one of {', '.join(towns)}")
@@ -186,6 +188,8 @@ def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:
     gap = torch.cdist(path, track).amin(1)
     # Nothing is driven after the last frame: what is chosen there does not count.
     finish = drive.get(keys.AGENT_FINISH, torch.zeros(len(track), dtype=torch.bool))[:-1].nonzero()
+    subtasks = drive.get(keys.AGENT_SUBTASK, torch.full((len(track),), int(SubTask.LANEFOLLOW))).clone()
+    subtasks[-1] = subtasks[-2]
     finish_distance = float((track[finish[0, 0]] - path[-1]).norm()) if len(finish) else None
     collision, off_road, wrong_lane = (
         bool(drive[key].any()) for key in (keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
@@ -207,5 +211,5 @@ def _judge(episode: Episode, drive: TensorDictBase) -> Outcome:
         largest_gap=round(float(gap.max()), 2),
         seconds=round((len(track) - 1) / 10, 1),
         track=track,
-        subtasks=drive.get(keys.AGENT_SUBTASK, torch.full((len(track),), int(SubTask.LANEFOLLOW))),
+        subtasks=subtasks,
     )

@@ -160,18 +160,19 @@ class BoundarySampler(DemonstrationSampler):
         seed: int = 0,
     ) -> None:
         stored = buffer.storage[:]
-        self._subtask = torch.as_tensor(stored[keys.SUBTASK])
-        self._snippets = cut_snippets(self._subtask, torch.as_tensor(stored[TRAJECTORY]))
+        self._snippets = cut_snippets(torch.as_tensor(stored[keys.SUBTASK]), torch.as_tensor(stored[TRAJECTORY]))
         lane = stored[keys.ROUTE][:, 1].long()
         found = find_segments(town, self._snippets, lane, max_junctions)
         lacking = [name for name, segments in found.items() if not segments]
         if lacking:
-            raise ValueError(f"no drive in {len(stored)} frames realises {', '.join(lacking)}; collect more")
+            where = f"{len(stored)} frames of {town.name}"
+            raise ValueError(f"no drive in {where} realises {', '.join(lacking)}; collect more, if its map allows them")
         self._segments = {name: _by_answer(segments) for name, segments in found.items()}
         self._misleading = find_misleading(town, self._snippets, lane, max_junctions) if misleading else {}
         lacking = [name for name, groups in self._misleading.items() if not groups]
         if lacking:
-            raise ValueError(f"no drive in {len(stored)} frames is misled by {', '.join(lacking)}; collect more")
+            where = f"{len(stored)} frames of {town.name}"
+            raise ValueError(f"no drive in {where} is misled by {', '.join(lacking)}; collect more, if its map can")
         self.decisions = 2 * max_junctions + 1
         self._passenger = Passenger()
         self.misleading = misleading

@@ -64,6 +64,8 @@ class DashCamera(Transform):
         yaw: turn of the mount to the right, rad.
         seed: of the numbers drawn; parallel workers need one each, for ``env.set_seed`` does not reach it.
 
+    Moved to a device, it moves the town's scenery, which all its cameras share: give it a town that is there already.
+
     Raises:
         ValueError: an unknown modality or appearance.
 

@@ -62,7 +62,7 @@ class Keyword:
                 keyword is returned as it is.
 
         Returns:
-            The keyword of :data:`KEYWORDS`.
+            The keyword of :data:`KEYWORDS`, or the one that was given.
 
         Raises:
             ValueError: no keyword has these words.

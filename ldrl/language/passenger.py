@@ -168,7 +168,7 @@ class Passenger:
         """Say it again, in the same words, and perhaps what is not meant."""
         again = words + rng.choice(spoken()["slots"]["confirmations"]).split() + words
         if rng.random() < DENIED:
-            another = rng.choice([other for other in KEYWORDS.values() if other != keyword])
+            another = rng.choice([other for other in KEYWORDS.values() if other.name != keyword.name])
             again += rng.choice(DENIALS).split() + self._phrase(another, rng).split()
         return again
 

@@ -58,7 +58,7 @@ def resolve_checkpoint(name: str | Path) -> Path:
     Raises:
         ValueError: there is neither; the message lists the names.
     """
-    for folder in (Path(name), SHIPPED / name):
+    for folder in (Path(str(name)), SHIPPED / str(name)):
         if (folder / CONFIG).is_file() and (_lender(folder) / WEIGHTS).is_file():
             return folder
     known = ", ".join(PRETRAINED) or "none"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 __all__ = ["MODELS", "AgentConfig", "Parts"]
@@ -78,7 +79,7 @@ class AgentConfig:
             if sizes.pop(name) not in known:
                 raise ValueError(f"{name} is {getattr(self, name)!r}; use one of {', '.join(known)}")
         convolutions = sizes.pop("conv_channels")
-        if len(convolutions) != 3:
+        if not isinstance(convolutions, Sequence) or len(convolutions) != 3:
             raise ValueError(f"conv_channels is {convolutions!r}; give three sizes, one for each convolution")
         for name, value in (*sizes.items(), *(("conv_channels", value) for value in convolutions)):
             if type(value) is not int or value < 1:

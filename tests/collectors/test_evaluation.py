@@ -146,6 +146,13 @@ def test_what_an_outcome_says():
     assert not _judge(EPISODE, drive(along())).stuck
 
 
+def test_what_is_chosen_at_the_last_frame_is_not_driven():
+    made = drive(along())
+    made[keys.AGENT_SUBTASK][-1] = SubTask.LEFT
+    assert _judge(EPISODE, made).subtasks[-1] == SubTask.STRAIGHT
+    assert made[keys.AGENT_SUBTASK][-1] == SubTask.LEFT
+
+
 def test_finish_counts_where_it_was_declared_first():
     made = drive(along(), finish=58)
     made[keys.AGENT_FINISH][10] = True
@@ -259,6 +266,8 @@ def test_subtasks_are_the_agents(untrained, sample, towns):
 
 
 def test_unknown_towns_and_no_episode(sample, towns):
+    with pytest.raises(ValueError, match="num_cars is 0; give at least 1"):
+        evaluate(Expert, sample, towns, num_cars=0)
     with pytest.raises(ValueError, match=r"unknown town 'town2'; use one of town1"):
         evaluate(Expert, sample, {"town1": towns["town1"]})
     assert evaluate(Expert, [], towns) == []

@@ -362,11 +362,11 @@ def test_errors_say_what_to_do(demonstrations, few, town2, monkeypatch):
     size = sampler.decisions + 1
     with pytest.raises(ValueError, match=f"batch of {size} does not divide into sequences of {size - 1} decisions"):
         sampler.sample(demonstrations.storage, size)
-    with pytest.raises(ValueError, match=r"no drive in 60 frames realises .*second right; collect more"):
+    with pytest.raises(ValueError, match=r"no drive in 60 frames of town2 realises .*second right; collect more"):
         BoundarySampler(few, town2)
     stored = few.storage[:]
     snippets = cut_snippets(stored[keys.SUBTASK], stored[TRAJECTORY])
     nothing = find_misleading(town2, snippets, stored[keys.ROUTE][:, 1].long())
     monkeypatch.setattr(segments, "find_misleading", lambda *_: nothing)
-    with pytest.raises(ValueError, match=r"no drive in 19200 frames is misled by left, .*; collect more"):
+    with pytest.raises(ValueError, match=r"no drive in 19200 frames of town2 is misled by left, .*; collect more"):
         BoundarySampler(demonstrations, town2, misleading=0.1)

@@ -8,7 +8,7 @@ from importlib import resources
 import pytest
 import yaml
 
-from ldrl.language import KEYWORDS, MEANINGFUL, Families, Passenger, Sentences, load_glove, normalise
+from ldrl.language import KEYWORDS, MEANINGFUL, SAFE_KEYWORDS, Families, Passenger, Sentences, load_glove, normalise
 from ldrl.language.passenger import DECISIVE, DENIALS
 from ldrl.language.spoken import training_words
 
@@ -252,3 +252,12 @@ def test_training_words_are_known_and_start_with_the_meaningful():
     assert set(words[:count]) <= MEANINGFUL
     assert {"left", "right", "straight", "first", "second", "skip"} <= set(words)
     assert all(normalise(word) == [word] for word in words)
+
+
+@pytest.mark.parametrize("keywords", [KEYWORDS, SAFE_KEYWORDS])
+def test_what_is_meant_is_never_denied(passenger, monkeypatch, keywords):
+    monkeypatch.setattr("ldrl.language.passenger.DENIED", 1.0)
+    monkeypatch.setattr(passenger, "_phrase", lambda keyword, _: keyword.name.replace(" ", "_"))
+    rng = random.Random(5)
+    denied = {passenger._repeat(keywords["left,right"], ["go"], rng)[-1] for _ in range(500)}
+    assert denied == {name.replace(" ", "_") for name in KEYWORDS} - {"left,right"}

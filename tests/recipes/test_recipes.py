@@ -316,6 +316,13 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
         (["stages=[]"], "nothing of model hih is trained, and nothing is taken from a trained agent"),
         (["misleading=25"], "misleading is 25; give a share from 0 to 1"),
         (["misleading=some"], "misleading is some; give a share from 0 to 1"),
+        (["misleading=true"], "misleading is True; give a share from 0 to 1"),
+        (["learning_rate=fast"], "learning_rate is 'fast'; give a number above 0"),
+        (["max_grad_norm=0"], "max_grad_norm is 0; give a number above 0"),
+        (["towns=[maps/a.xodr,other/a.xodr]"], "give each town once, and maps whose files have other names"),
+        (["name=../elsewhere"], "name is '../elsewhere'; give that of a folder below runs/"),
+        (["appearance=episode"], "appearance is 'episode', but training has frames, not episodes"),
+        (["start_from.low_level=7"], "no checkpoint '7'"),
         (["high_level_steps=0"], "high_level_steps is 0; give a whole number of at least 1"),
         (["sentences=many"], "sentences is 'many'; give a whole number of at least 1"),
         (["episodes_per_keyword=-1"], "episodes_per_keyword is -1; give a whole number of at least 0"),
@@ -327,6 +334,7 @@ def test_bad_arguments_of_evaluate(trained, some, tmp_path, call, arguments, mes
         (["test_towns=[town2,atlantis]"], "'atlantis'"),
         (["modality=ps", "segmenter=."], "segmenter"),
         (["size.features=0"], "features is 0; give a whole number above 0"),
+        (["size.conv_channels=8"], "conv_channels is 8; give three sizes"),
         (["size.image_rows=10"], "rows is 10"),
         (["device=moon"], "moon"),
     ],
@@ -344,6 +352,7 @@ def test_bad_arguments_of_training(tmp_path, call, arguments, message):
     [
         ("demonstration_frames=1000", "1000 frames do not divide among 128 cars"),
         ("batch_slices=6", "use a multiple of"),
+        ("demonstration_frames=1280", "no drive in 1280 frames of town1 realises left, right"),
     ],
 )
 def test_settings_that_do_not_fit_show_before_the_sentences_are_learned(tmp_path, call, argument, message):

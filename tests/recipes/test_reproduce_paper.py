@@ -42,6 +42,8 @@ if folder.name == os.environ.get("EDITED"):
         preset.write("learning_rate: 1\\n")
 if "out" not in given:
     (folder / "agent.safetensors").write_text(" ".join(sys.argv[1:]) + os.environ.get("WEIGHTS", ""))
+    if "start_from.demonstrations" not in given:
+        (folder / "demonstrations").mkdir(exist_ok=True)
 records = [
     {"town": town, "keyword": keyword, "success": good, "strict_success": False}
     for town in ("town1", "town2") for keyword, good in (("left", True), ("left,left", town == "town1"))
@@ -141,6 +143,8 @@ def test_a_cell_that_lost_a_file_is_made_again(reproduce):
     for lost in ("gs-hih-unseen/made.json", "gs-hih-unseen/report.json", "gs-hih/agent.safetensors"):
         Path("runs/paper/seed0", lost).unlink()
         assert reproduce("tables=[unseen]")[0] == [f"seed0/{Path(lost).parent}"]
+    Path("runs/paper/seed0/gs-low/demonstrations").rmdir()
+    assert reproduce("tables=[unseen]")[0] == ["seed0/gs-low"]
 
 
 def test_a_cell_whose_command_changed_is_made_again_with_what_starts_from_it(reproduce, monkeypatch):
