@@ -149,7 +149,7 @@ def test_unknown_classes_and_weights(tmp_path):
 
 def test_without_transformers(monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ImportError, match=r"ldrl\[ps\]"):
+    with pytest.raises(ImportError, match=r"pip install transformers"):
         RoadSegmenter()
 
 
