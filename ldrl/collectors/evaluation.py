@@ -27,8 +27,6 @@ NEAR = 10.0
 """A drive succeeds that passes every point of the path, and its last, this close (paper's evaluation), m."""
 FINISH_NEAR = 15.0
 """Strictly, ``finish`` must be declared this close to the path's last point, m."""
-CARS_IN_ENV = 64
-"""An env draws what all its cars see until the last has ended; and each env has a fixed cost at every step."""
 RECORDED = (keys.POSE, keys.SPEED, keys.COLLISION, keys.OFF_ROAD, keys.WRONG_LANE)
 
 
@@ -111,25 +109,23 @@ def evaluate(
     unknown = {episode.town for episode in episodes} - set(towns)
     if unknown:
         raise ValueError(f"unknown town {min(unknown)!r}; use one of {', '.join(towns)}")
-    in_env = min(num_cars, CARS_IN_ENV)
-    parts = []
-    for name, town in towns.items():
-        rows = [i for i, episode in enumerate(episodes) if episode.town == name]
-        # Episodes of like length together: an env drives until its last car is done.
-        rows.sort(key=lambda i: len(episodes[i].path))
-        there = town.on(device)
-        actor = policy if isinstance(policy, TensorDictModuleBase) else policy(there)
-        parts += [(actor, there, rows[first : first + in_env]) for first in range(0, len(rows), in_env)]
-    outcomes: dict[int, Outcome] = {}
+    there = {name: town.on(device) for name, town in towns.items()}
+    names = [episode.town for episode in episodes]
+    order = sorted(range(len(episodes)), key=lambda i: list(towns).index(names[i]))
+    if isinstance(policy, TensorDictModuleBase):
+        groups = [(policy, order)]
+    else:  # town by town
+        groups = [(policy(there[name]), list(rows)) for name, rows in groupby(order, names.__getitem__)]
     make = partial(make_env, appearance=appearance, segmenter=segmenter, device=device)
-    for _, group in groupby(parts, lambda part: id(part[0])):  # of one policy
-        same = list(group)
-        for first in range(0, len(same), num_cars // in_env):
+    outcomes: dict[int, Outcome] = {}
+    for actor, group in groups:
+        for first in range(0, len(group), num_cars):
             drives = []
-            for actor, there, rows in same[first : first + num_cars // in_env]:
-                own = [episodes[i] for i in rows]
-                drives.append(_Drives(make(there, episodes=own, policy=actor, seed=rows[0]), rows))
-            _drive(drives, same[first][0], progress)
+            for name, rows in groupby(group[first : first + num_cars], names.__getitem__):
+                own = list(rows)
+                env = make(there[name], episodes=[episodes[i] for i in own], policy=actor, seed=own[0])
+                drives.append(_Drives(env, own))
+            _drive(drives, actor, progress)
             for each in drives:
                 outcomes |= {i: _judge(episodes[i], drive) for i, drive in zip(each.rows, each.driven(), strict=True)}
     return [outcomes[i] for i in range(len(episodes))]

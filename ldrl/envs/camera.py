@@ -45,6 +45,25 @@ def shift(pose: Tensor, lateral: Tensor | float, yaw: Tensor | float) -> Tensor:
     return torch.stack((x - heading.sin() * lateral, y + heading.cos() * lateral, heading + yaw), -1)
 
 
+def see_moving(transform: Transform, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    """The step of a transform that makes images: for the cars that move only; those that ``_step`` leaves out see black.
+
+    Args:
+        transform: what makes images, of any batch of cars.
+        tensordict: batch size ``[B]``, before the step.
+        next_tensordict: batch size ``[B]``, after it.
+    """
+    moving = tensordict.get("_step", None)
+    if moving is None:
+        return transform._call(next_tensordict)
+    moving = moving.view(next_tensordict.batch_size)
+    read = next_tensordict.select(keys.POSE, keys.TRAFFIC, keys.APPEARANCE, keys.IMAGE, strict=False)
+    seen = transform._call(read[moving])[keys.IMAGE]
+    image = seen.new_zeros((*moving.shape, *seen.shape[1:]))
+    image[moving] = seen
+    return next_tensordict.set(keys.IMAGE, image)
+
+
 class DashCamera(Transform):
     """Draws the 88x200 image of a forward camera from ``("world", "pose")``, the whole batch at once.
 
@@ -177,6 +196,11 @@ class DashCamera(Transform):
             )
         tensordict[keys.APPEARANCE] = self._numbers.view(*tensordict.batch_size, 1)
         return tensordict[keys.APPEARANCE]
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self.appearance == "episode":
+            self._episodes_numbers(next_tensordict)
+        return see_moving(self, tensordict, next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Draw the images of a batch from a replay buffer."""

@@ -18,6 +18,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import Transform
 
 from ldrl import keys
+from ldrl.envs.camera import see_moving
 from ldrl.envs.image_format import PREPROCESSING, ImageFormat
 
 if TYPE_CHECKING:
@@ -89,6 +90,8 @@ class RoadSegmenter(Transform):
         return road.view(*batch, *road.shape[1:])
 
     _apply_transform = segment
+
+    _step = see_moving
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

@@ -171,6 +171,25 @@ def test_images_follow_resets(town2):
     assert torch.equal(again[keys.IMAGE][[0, 2]], td[keys.IMAGE][[0, 2]])
 
 
+@pytest.mark.parametrize("appearance", ["clear", "episode"])
+def test_only_cars_that_move_see(town2, appearance, monkeypatch):
+    def env():
+        return TransformedEnv(TownEnv(town2, 4, seed=0), DashCamera(town2, modality="rgb", appearance=appearance))
+
+    some, every = env(), env()
+    td = every.rand_action(every.reset())
+    action, moves = td[keys.ACTION], torch.tensor([True, False, False, True])
+    expected = every.step(td)["next"]
+    drawn, draw = [], DashCamera.draw
+    monkeypatch.setattr(DashCamera, "draw", lambda self, *given: drawn.append(len(given[0])) or draw(self, *given))
+    found = some.step(some.reset().set(keys.ACTION, action).set("_step", moves))["next"]
+    assert drawn == [4, 2]
+    assert torch.equal(found[keys.IMAGE][moves], expected[keys.IMAGE][moves])
+    assert not found[keys.IMAGE][~moves].any()
+    if appearance == "episode":
+        assert torch.equal(found[keys.APPEARANCE], expected[keys.APPEARANCE])
+
+
 def test_junctions_are_road(town1):
     lane = next(i for i in range(len(town1.lane_length)) if town1.lane_manoeuvre[i] in MANOEUVRES)
     first = int(town1.lane_first[lane])

@@ -218,6 +218,17 @@ def test_in_an_env(town2, episodes):
     assert again[keys.IMAGE].shape == (3, 1, 88, 200)
 
 
+def test_only_cars_that_move_see(town2, episodes):
+    env = make_env(town2, episodes=episodes["town2"][:3], modality="ps")
+    td = env.rand_action(env.reset())
+    moves = torch.tensor([True, False, True])
+    found = env.step(td.set("_step", moves))["next", *keys.IMAGE]
+    poses = td["next", *keys.POSE]
+    expected = RoadSegmenter().segment(DashCamera(town2, modality="rgb").draw(poses))
+    assert torch.equal(found[moves], expected[moves])
+    assert not found[~moves].any()
+
+
 def test_on_highway_env(episodes):
     env = make_highway_env("town2", episode=episodes["town2"][0], modality="ps")
     check_env_specs(env)
