@@ -1,10 +1,11 @@
 """Train and evaluate what the paper's tables need, and write docs/results.md with ours beside the paper's figures.
 
-    python recipes/reproduce_paper.py                       # all tables, one seed
-    python recipes/reproduce_paper.py "seeds=[0,1,2]"       # all three
-    python recipes/reproduce_paper.py "tables=[models]"     # only what one table needs
-    python recipes/reproduce_paper.py "tables=[]"           # only write the page again
-    python recipes/reproduce_paper.py scale=smoke           # everything in little, to see it run
+    python recipes/reproduce_paper.py                                # all of the paper's tables, one seed
+    python recipes/reproduce_paper.py "seeds=[0,1,2]"                # three
+    python recipes/reproduce_paper.py "tables=[appearance,unseen]"   # looks in training and at night, unseen towns
+    python recipes/reproduce_paper.py "tables=[models]"              # only what one table needs
+    python recipes/reproduce_paper.py "tables=[]"                    # only write the page again
+    python recipes/reproduce_paper.py scale=smoke                    # in little, to see it run
 
 A cell is one training with its evaluation, or one evaluation, done by a command that one may also type; which ones
 there are is said in config/reproduce_paper.yaml. Cells go to runs/paper/seed<k>/<cell>/, with what they print in
@@ -138,9 +139,11 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 read = ("bc_hierarchical.yaml", "preset/default.yaml", f"preset/{cfg.scale}.yaml", "size/small.yaml")
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
-                decides = table.get(taken_from.get("high_level"), {}).get("stages", [])
-                if "high_level" in decides and "low_level" in taken_from:  # a single policy has no levels
-                    for steps in (f"{stage}_steps" for stage in given["stages"]):
+                learned = {stage for other in taken_from.values() for stage in table[other].get("stages", [])}
+                if learned.intersection(given["stages"]):
+                    # A single policy has no levels.
+                    trained = given["stages"] if "low_level" in taken_from else ["drives"]
+                    for steps in (f"{stage}_steps" for stage in trained):
                         if steps in settings.again:
                             given.setdefault(steps, settings.again[steps])
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}

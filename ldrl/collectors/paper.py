@@ -98,4 +98,4 @@ TARGETS = (
 LEAST_IOU = 0.95
 """Intersection over union of the road that the segmenter should reach."""
 MOST_MINUTES = 120
-"""In which all cells of a seed should be made, on two CPU cores."""
+"""In which the cells of the paper's tables should be made for a seed, on two CPU cores."""

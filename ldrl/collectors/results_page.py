@@ -42,6 +42,8 @@ LOOKS = {
     "drawn for every image; driven at night": "rgb-hih-night",
     "one; driven at night": "rgb-hih-clear-night",
 }
+BEYOND = ("rgb-low-clear", *(cell for cell in LOOKS.values() if cell != "rgb-hih"), "gs-hih-unseen")
+"""Cells of no table of the paper: looks and unseen towns."""
 FAMILIES = {family: f"gs-hih-{family}" for family in ("paraphrase", "ambiguity", "noise", "rambling")}
 NAMES = {cell: name for table in (FULL, EVERY, MODELS) for name, cell in table.items()} | {
     "gs-hih": "Hih, gs",
@@ -134,8 +136,9 @@ def _shortfalls(results: Results, cells: Sequence[str], segmenter: Mapping[str, 
         if row["iou"] < LEAST_IOU
     ]
     missed += [
-        f"- time, seed {seed}: {_busy(timed) / 60:.0f} minutes by the clock, to reach is {MOST_MINUTES} for all cells."
-        for seed, timed in _by_seed(results, cells)
+        f"- time, seed {seed}: {_busy(timed) / 60:.0f} minutes by the clock for the paper's tables, to reach is "
+        f"{MOST_MINUTES}."
+        for seed, timed in _by_seed(results, [cell for cell in cells if cell not in BEYOND])
         if _busy(timed) > 60 * MOST_MINUTES
     ]
     below: dict[bool, list[str]] = {True: [], False: []}
@@ -197,9 +200,12 @@ def segmenter_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _time(results: Results, cells: Sequence[str]) -> Iterator[str]:
     known = [result for result in results if result.cell in cells]
-    for seed, timed in _by_seed(results, cells):
-        clock, added = (f"{seconds / 60:.0f}" for seconds in (_busy(timed), sum(result.seconds for result in timed)))
-        yield f"Seed {seed}: {len(timed)} of {len(cells)} cells took {clock} minutes by the clock, {added} added up."
+    paper = [cell for cell in cells if cell not in BEYOND]
+    for what, some in (("the paper's tables", paper), ("looks and unseen towns", [c for c in cells if c in BEYOND])):
+        for seed, timed in _by_seed(results, some):
+            clock, added = (f"{s / 60:.0f}" for s in (_busy(timed), sum(result.seconds for result in timed)))
+            took = f"{len(timed)} of {len(some)} cells took {clock} minutes by the clock, {added} added up"
+            yield f"Seed {seed}, {what}: {took}."
     for what in ("hardware", "versions"):
         yield f"{what.capitalize()}: {'; '.join(sorted({getattr(result, what) for result in known})) or '-'}."
     lines, commands = [("cell", "minutes", "seeds")], []

@@ -46,7 +46,7 @@ def shift(pose: Tensor, lateral: Tensor | float, yaw: Tensor | float) -> Tensor:
 
 
 def see_moving(transform: Transform, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-    """The step of a transform that makes images: for the cars that move only; those that ``_step`` leaves out see black.
+    """The step of a transform that makes images, of the cars that move; those that ``_step`` holds see black.
 
     Args:
         transform: what makes images, of any batch of cars.
