@@ -69,7 +69,8 @@ class DashCamera(Transform):
 
     The same transform serves an env (draw now) and a replay buffer (draw when sampled). The camera stands 1.6 m ahead
     of the vehicle's origin and 1.7 m above a flat road, has no pitch, and sees 90 degrees across. Buildings, trees,
-    posts and the other cars of ``("world", "traffic")``, if there are any, hide what is behind them.
+    posts and the other cars of ``("world", "traffic")``, if there are any, hide what is behind them. In a step of some
+    cars only, as ``_step`` says, the others see black.
 
     Args:
         town: what there is to see.
