@@ -124,32 +124,40 @@ class Ground:
     ) -> Tensor:
         """Materials from the nearest lane's coordinates, m."""
         noise, fleck, slab = texture
-        arc = self.arc[point][:, None, :, None] + along
-        code = (Material.ASPHALT + noise * 6).to(torch.uint8)
-        patch = self.patched[point][:, None, :, None] & ((across - 0.4).abs() < 1.1)
-        code = torch.where(patch, (Material.PATCH + (fleck > 0.5)).to(torch.uint8), code)
-        code = self._mark(code, point, arc, across, fleck > 0.06)
-        code.masked_fill_(beyond > 0, Material.KERB)
-        code = torch.where(beyond > KERB, (Material.SIDEWALK + slab * 3).to(torch.uint8), code)
+        code = torch.where(beyond > KERB, (Material.SIDEWALK + slab * 3).to(torch.uint8), int(Material.KERB))
         code = torch.where(beyond > SIDEWALK - VERGE, (Material.GRASS + noise * 4).to(torch.uint8), code)
         yard = (beyond > SIDEWALK) & ~green
-        return torch.where(yard, (Material.YARD + noise * 3).to(torch.uint8), code)
+        code = torch.where(yard, (Material.YARD + noise * 3).to(torch.uint8), code)
+        # Most cells have no road; those that have, N of them, are worked out by themselves.
+        row, column = (beyond <= 0).any(3).any(1).nonzero().unbind(-1)
+        lane = [values[row, :, column] for values in (along, across, noise, fleck)]
+        road = self._road(point[row, column].view(-1, 1, 1), *lane)
+        code[row, :, column] = torch.where(beyond[row, :, column] > 0, code[row, :, column], road)
+        return code
+
+    def _road(self, point: Tensor, along: Tensor, across: Tensor, noise: Tensor, fleck: Tensor) -> Tensor:
+        """Materials of the road in some cells, ``[N, 4, 4]``; ``point`` is ``[N, 1, 1]``."""
+        arc = self.arc[point] + along
+        code = (Material.ASPHALT + noise * 6).to(torch.uint8)
+        patch = self.patched[point] & ((across - 0.4).abs() < 1.1)
+        code = torch.where(patch, (Material.PATCH + (fleck > 0.5)).to(torch.uint8), code)
+        return self._mark(code, point, arc, across, fleck > 0.06)
 
     def _mark(self, code: Tensor, point: Tensor, arc: Tensor, across: Tensor, whole: Tensor) -> Tensor:
         """Paint the lines of lanes outside junctions, worn here and there."""
-        half = self.lane_half[point][:, None, :, None]
+        half = self.lane_half[point]
         dash = (arc % (2 * DASH)) < DASH
         for side, edge in zip(self.sides, (across + half, across - half), strict=True):
-            kind = side[point][:, None, :, None]
+            kind = side[point]
             line = (edge.abs_() < LINE) & whole
             code.masked_fill_(line & (kind == Material.EDGE_LINE), Material.EDGE_LINE)
             code.masked_fill_(line & (kind == Material.LANE_LINE) & dash, Material.LANE_LINE)
             centre = line & (kind == Material.CENTRE_LINE)
             code.masked_fill_(centre & dash, Material.CENTRE_LINE)
             code.masked_fill_(centre & ~dash, Material.CENTRE_GAP)
-        before = self.end[point][:, None, :, None] - arc
+        before = self.end[point] - arc
         # A junction's lanes start where the lane before ends, and the ground there may be nearest to either.
-        begins = ~self.street[point][:, None, :, None] & (arc < 0)
+        begins = ~self.street[point] & (arc < 0)
         stops = (((before >= 0) & (before < STOP_LINE)) | begins) & (across.abs() < half) & whole
         return code.masked_fill_(stops, Material.STOP_LINE)
 

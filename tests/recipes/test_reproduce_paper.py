@@ -114,7 +114,7 @@ def test_a_command_is_one_that_a_user_can_type(reproduce):
     # What starts from one that has learned the same already is trained for less long.
     trained = {name for name, command in commands.items() if "stages=" in command and "stages=[]" not in command}
     assert {name for name in trained if "_steps" not in commands[name]} == {"gs-low", "reader", "gs-hih"}
-    assert "language_steps=1500 high_level_steps=600" in commands["gs-nmc"]
+    assert "language_steps=1000 high_level_steps=400" in commands["gs-nmc"]
     assert " drives_steps=150 " in commands["gs-single"]
     assert " low_level_steps=800 " in commands["rgb-low"]
 
