@@ -129,6 +129,8 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
         folder = Path("runs") / settings.name / f"seed{seed}"
         for name in (name for name in table if name in wanted):
             given = dict(table[name])
+            for setting, value in settings.cells.get(name, {}).items():
+                given.setdefault(setting, value)
             taken = tuple(folder / needed for needed in needs(given))
             if "checkpoint" in given:
                 recipe, read, makes = EVALUATION, ("evaluate.yaml",), ()
@@ -139,13 +141,6 @@ def make_cells(cfg: DictConfig) -> list[Cell]:
                 read = ("bc_hierarchical.yaml", "preset/default.yaml", f"preset/{cfg.scale}.yaml", "size/small.yaml")
                 own = {"name": (folder / name).relative_to("runs"), "seed": seed, "preset": cfg.scale}
                 taken_from = given.pop("start_from", {})
-                learned = {stage for other in taken_from.values() for stage in table[other].get("stages", [])}
-                if learned.intersection(given["stages"]):
-                    # A single policy has no levels.
-                    trained = given["stages"] if "low_level" in taken_from else ["drives"]
-                    for steps in (f"{stage}_steps" for stage in trained):
-                        if steps in settings.again:
-                            given.setdefault(steps, settings.again[steps])
                 given = own | given | {f"start_from.{level}": folder / cell for level, cell in taken_from.items()}
             arguments = tuple(argument(*item) for item in given.items())
             cells.append(Cell(folder / name, recipe, read, arguments, taken, makes))
