@@ -72,8 +72,8 @@ class Training:
     def __init__(self, cfg: DictConfig, agent: Agent, folder: Path) -> None:
         self.cfg, self.agent, self.folder = cfg, agent, folder
         self.policy = agent.high_level if isinstance(agent, HierarchicalAgent) else agent.policy
-        drives = set(cfg.stages) - {"language"}  # what is said is learned anywhere
-        self.towns = [Town.load(name) for name in cfg.towns] if drives else []
+        needs_towns = set(cfg.stages) - {"language"}  # reading is learned from sentences alone
+        self.towns = [Town.load(name) for name in cfg.towns] if needs_towns else []
         self.given: dict[str, Buffer] = {}
         if cfg.start_from.demonstrations is not None:
             for town in self.towns:
