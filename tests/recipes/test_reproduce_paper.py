@@ -127,6 +127,7 @@ def test_the_recipes_take_the_commands(reproduce, scale):
     assert error is None
     commands = [json.loads(path.read_text())["command"] for path in Path("runs").rglob("made.json")]
     assert len(commands) == len(CONFIG["cells"])
+    assert CONFIG["scales"][scale]["cells"].keys() <= CONFIG["cells"].keys()
     with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
         for command in commands:
             recipe, *arguments = shlex.split(command)[1:]
