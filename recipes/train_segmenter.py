@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 from tqdm import tqdm
 
-from ldrl.collectors.report import check_whole_numbers
+from ldrl.collectors.report import check_whole_numbers, replacing
 from ldrl.collectors.results_page import segmenter_table
 from ldrl.envs import DashCamera, RoadSegmenter
 from ldrl.envs.appearance import WEATHERS
@@ -201,9 +201,11 @@ def main(cfg: DictConfig) -> None:
         "versions": f"Python {platform.python_version()}, torch {torch.__version__}",
     }
     report = {"details": details, "config": OmegaConf.to_container(cfg), "rows": rows}
-    (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     listed = "\n".join(f"- {name}: {told}" for name, told in details.items())
-    (folder / "report.md").write_text(f"# {folder.name}\n\n{segmenter_table(rows)}\n\n{listed}\n", encoding="utf-8")
+    with replacing(folder / "report.json") as file:
+        file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    with replacing(folder / "report.md") as file:
+        file.write_text(f"# {folder.name}\n\n{segmenter_table(rows)}\n\n{listed}\n", encoding="utf-8")
     print(f"\n{segmenter_table(rows)}\nEverything is in {folder}/; start with report.md and views.png.")
 
 

@@ -115,8 +115,8 @@ def test_a_command_is_one_that_a_user_can_type(reproduce):
     trained = {name for name, command in commands.items() if "stages=" in command and "stages=[]" not in command}
     whole = {name for name in trained if "_steps" not in commands[name]}
     assert whole == {"gs-low", "reader", "gs-hih", "gs-h0"}
-    assert "language_steps=1000 high_level_steps=400" in commands["gs-nmc"]
-    assert " drives_steps=120 " in commands["gs-single"]
+    assert "language_steps=1000 high_level_steps=300" in commands["gs-nmc"]
+    assert " drives_steps=100 " in commands["gs-single"]
     assert " low_level_steps=1200 " in commands["rgb-low"]
 
 
